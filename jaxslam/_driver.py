@@ -20,17 +20,25 @@ from jaxslam._origin import (
 from jaxslam._public import publish
 from jaxslam._rounding import doubt_on_run
 from jaxslam.association._rules import Known
-from jaxslam.core._numbers import check_covariance, check_key, is_concrete, largest, shape_text
+from jaxslam.core._numbers import is_concrete, largest
 from jaxslam.core._validation import (
-    check_log,
-    check_record,
     checked_estimate,
+    log_of,
     reworded_tracer_errors,
     same_state,
     state_and_info,
 )
 from jaxslam.core.protocols import Filter, Wrapper
 from jaxslam.core.types import Log, Scan, Status, Trace
+from jaxslam.core.validation import (
+    InvalidField,
+    covariance,
+    finite,
+    instance_of,
+    prng_key,
+    refusals_of,
+    require,
+)
 from jaxslam.math._xla import hot_jit
 
 
@@ -78,13 +86,18 @@ def run(
         UserWarning: on concrete ranges below 0, which a sensor writes where it met nothing. Noise
             makes few of them of landmarks that are near.
     """
-    check_record("run", "filter", filter, Filter)
-    check_record("run", "log", log, Log)
+    with refusals_of("run"):
+        require("filter", filter, instance_of(Filter))
     # A user's transfer guard is there for loops of the user's; arguments may be on the host.
-    with jax.transfer_guard("allow"), reworded_tracer_errors(f"run: {filter.name}"):
-        check_run("run", filter, log, pose, pose_cov)
+    with (
+        jax.transfer_guard("allow"),
+        refusals_of(f"run: {filter.name}"),
+        reworded_tracer_errors(),
+    ):
+        with refusals_of("run"):
+            check_run(filter, log, pose, pose_cov)
+            require("key", key, prng_key)
         _notice_negative_ranges(filter, log.scan)
-        check_key("run", key)
         # A new array is a tracer where a trace is active, also where all arguments are constants.
         if not is_concrete(filter, log, pose, pose_cov, key, jnp.zeros(())):
             traced: Trace = _drive_in_trace(filter, log, pose, pose_cov, key, probe)
@@ -108,16 +121,10 @@ def run(
         return trace._replace(estimate=to_map_coordinates(jax.device_get(trace.estimate), origin))
 
 
-def check_run(name: str, filter: Filter, log: Log, pose: ArrayLike, pose_cov: ArrayLike) -> None:
-    """Raise ValueError, which begins with the caller's name, unless a log and a start are what
-    `run` takes."""
-    check_log(
-        name,
-        log,
-        control_size=len(filter.controls),
-        measurement_size=len(filter.measurements),
-        parts=filter.places,
-    )
+def check_run(filter: Filter, log: Log, pose: ArrayLike, pose_cov: ArrayLike) -> None:
+    """Raise InvalidField unless a log and a start are what `run` takes."""
+    sizes = len(filter.controls), len(filter.measurements)
+    require("log", log, log_of(*sizes, filter.places))
     inner = filter
     while isinstance(inner, Wrapper):
         inner = inner.filter
@@ -127,19 +134,13 @@ def check_run(name: str, filter: Filter, log: Log, pose: ArrayLike, pose_cov: Ar
     if by_tag and size is not None and not filter.places and is_concrete(scan.tag, scan.valid):
         tag = np.max(np.where(scan.valid, scan.tag, -1), initial=-1)
         if tag >= size:
-            raise ValueError(
-                f"{name}: the log has a measurement of landmark {tag}, the map of {filter.name} "
-                f"has {size}, 0 to {size - 1}; a map of some landmarks needs their tags"
+            raise InvalidField(
+                "log",
+                f"it has a measurement of landmark {tag}, the map of {filter.name} has {size}, "
+                f"0 to {size - 1}; a map of some landmarks needs their tags",
             )
-    if (got := shape_text(pose)) != "(3,)":
-        raise ValueError(f"{name}: expected a pose (x, y, θ) of shape (3,), got {got}")
-    if is_concrete(pose):
-        values = np.asarray(pose)
-        if values.dtype.kind not in "biuf":
-            raise ValueError(f"{name}: expected a pose of real numbers, got {pose!r}")
-        if not np.all(np.isfinite(values)):
-            raise ValueError(f"{name}: the initial pose is not finite, got {values.tolist()}")
-    check_covariance(f"{name}: pose_cov", pose_cov, 3)
+    require("pose", pose, finite(3))
+    require("pose_cov", pose_cov, covariance(3))
 
 
 def _notice_negative_ranges(filter: Filter, scan: Scan) -> None:
@@ -173,21 +174,21 @@ def _drive(
     dtype = jnp.result_type(log.control, log.scan.z)
     tag = log.scan.tag.astype(jnp.int32)  # of any integers, unsigned ones too
     log = Log(log.control.astype(dtype), Scan(log.scan.z.astype(dtype), tag, log.scan.valid))
-    name, most = f"run: {filter.name}", largest(log.control)
+    most = largest(log.control)
     start = filter.init(jnp.asarray(pose, dtype), jnp.asarray(pose_cov, dtype))
     keys = jax.random.split(key, (log.control.shape[0], 2))
 
     def step(state: PyTree, row: tuple[Log, jax.Array]) -> tuple[PyTree, PyTree]:
         (control, scan), (key_predict, key_update) = row
         predicted = filter.predict(state, control, key_predict)
-        state = same_state(f"{name}: predict", state, predicted)
+        state = same_state("predict", state, predicted)
         # Under jit values are not checked before, and a NaN would spread through the whole state.
         lost = scan.valid & ~(jnp.abs(scan.z) <= most).all(axis=1)
         scan = scan._replace(valid=scan.valid & ~lost)
-        state, info = state_and_info(name, state, scan, filter.update(state, scan, key_update))
+        state, info = state_and_info(state, scan, filter.update(state, scan, key_update))
         status = jnp.where(lost, jnp.int32(Status.REJECTED), info.status)
         info = info._replace(status=status.astype(info.status.dtype))
-        estimate = checked_estimate(name, filter.estimate(state), dtype)
+        estimate = checked_estimate(filter.estimate(state), dtype)
         return state, (estimate, info, None if probe is None else probe(state))
 
     # XLA cannot merge the body of a scan with its recomputation, so no barrier is needed.

@@ -97,7 +97,7 @@ class RightInvariant(Chart):
     ) -> tuple[Pose, Landmark]:
         if landmark.shape != (self.landmark_size,):
             reason = f"expected shape ({self.landmark_size},), got {landmark.shape}"
-            raise InvalidField(f"RightInvariant(rays={self.rays})", "landmark", reason)
+            raise InvalidField("landmark", reason, owner=f"RightInvariant(rays={self.rays})")
         moved = se2.exp(dx)
         shift = se2.exp(jnp.concatenate([dl[:2], dx[2:]]))
         point = se2.from_frame(shift, landmark[:2])

@@ -130,10 +130,10 @@ class Existence(Life):
         false, detected, remove, confirm = self.false, self.detected, self.remove, self.confirm
         if is_concrete(false, detected) and not 0 < false < detected < 1:
             reason = f"expected 0 < false < detected < 1, got {false}, {detected}"
-            raise InvalidField(type(self).__name__, "", reason)
+            raise InvalidField("", reason)
         if is_concrete(remove, confirm) and not 0 < remove < 0.5 < confirm < 1:
             reason = f"expected 0 < remove < 1/2 < confirm < 1, got {remove}, {confirm}"
-            raise InvalidField(type(self).__name__, "", reason)
+            raise InvalidField("", reason)
         super().__post_init__()
 
     def init(self, pose: Float[Array, "3"], landmarks: Float[Array, "N L"]) -> Evidence:

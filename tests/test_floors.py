@@ -304,7 +304,7 @@ def test_pickles_have_public_paths_and_load_in_a_fresh_process():
         jaxslam.filters.EkfSlam(model, jaxslam.sensors.RangeBearing(np.eye(2)), 3),
         jaxslam.scenarios.circle(steps=3).sensor,
         jaxslam.run,
-        InvalidField("Own", "gate", "expected a number, got None"),
+        InvalidField("gate", "expected a number, got None", owner="Own"),
     )
     data = pickle.dumps(values)
     for path in re.findall(rb"jaxslam[.\w]*", data):

@@ -28,9 +28,8 @@ from jaxslam._cli.common import (
     write_results,
 )
 from jaxslam.consistency.campaign._progress import Progress
-from jaxslam.core._numbers import check_count
 from jaxslam.core.types import JaxOrNumPy
-from jaxslam.core.validation import InvalidField
+from jaxslam.core.validation import InvalidField, at_least, refusals_of, require
 from jaxslam.datasets import _g2o as g2o
 from jaxslam.graphs import Ending, Graph
 from jaxslam.graphs._checks import label, variables_in
@@ -123,7 +122,7 @@ class OptimizePlan:
                 f"--animate: the kernel {self.kernel} is solved in rounds of many iterations each; "
                 "films show the iterations of one"
             )
-        check_count("--iterations", self.iterations)
+        require("--iterations", self.iterations, at_least(1))
 
     @classmethod
     def from_options(cls, options: argparse.Namespace) -> "OptimizePlan":
@@ -232,7 +231,8 @@ def read_problem(plan: OptimizePlan) -> Problem:
     factor_of = {**graphs.REGISTRY, "relative_pose": ERRORS[plan.error][0]}
     factors = {key: factor_of[key] for key in loaded.graph.tables}
     graph = graphs.with_gauge(loaded.graph, factors)
-    graphs.check_graph(str(plan.path), graph, factors)
+    with refusals_of(str(plan.path)):
+        graphs.check_graph(graph, factors)
     kernel = plan.robust_kernel
     if kernel is None:
         return Problem(loaded, graph, factors, None)

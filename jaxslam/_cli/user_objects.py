@@ -13,8 +13,9 @@ from types import ModuleType
 
 from jaxslam._cli.common import pick
 from jaxslam.catalog import ALL
-from jaxslam.consistency.campaign._candidates import check_fits, check_noise
+from jaxslam.consistency.campaign._candidates import candidate_for, check_noise
 from jaxslam.core.protocols import Candidate, Filter
+from jaxslam.core.validation import refusals_of, require
 from jaxslam.simulation._worlds import World
 from jaxslam.simulation.scenarios import SCENARIOS
 from jaxslam.verify._inputs.user_files import import_file, names_in, split_target
@@ -52,7 +53,8 @@ class UserObjects:
                 f"{entry}: expected a Scenario, or a function that returns one, "
                 f"{_mismatch(value, world)}"
             )
-        check_noise(world)
+        with refusals_of("--scenario"):
+            check_noise(world)
         return world
 
     def filters(self, names: str, scenario: World) -> dict[str, Candidate]:
@@ -113,7 +115,8 @@ class UserObjects:
                 f"{entry}: expected a Filter, or a function of the scenario that returns one, "
                 f"{_mismatch(value, candidate)}"
             )
-        check_fits(name, candidate, scenario)
+        with refusals_of("--filters"):
+            require(name, candidate, candidate_for(scenario))
         return name, candidate
 
     def _call(

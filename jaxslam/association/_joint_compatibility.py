@@ -47,7 +47,7 @@ class JointCompatibility:
     `exhausted` is set"""
 
     def __post_init__(self) -> None:
-        check_new_gate("JointCompatibility", self.probability, self.new_gate)
+        check_new_gate(self.probability, self.new_gate)
 
     def __call__(self, prediction: Prediction, scan: Scan) -> Association:
         pairs: Pairs = jax.lax.stop_gradient(prediction.pairs(scan))

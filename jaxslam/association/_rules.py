@@ -32,15 +32,14 @@ def gate_probability(value: Number | None) -> Number | None:
     return gate
 
 
-def check_new_gate(owner: str, gate: Number | None, new_gate: Number | None) -> None:
+def check_new_gate(gate: Number | None, new_gate: Number | None) -> None:
     """Raise InvalidField on a new_gate that is not at least the gate."""
     if new_gate is None:
         return
     if gate is None:
-        raise InvalidField(owner, "new_gate", f"expected None without a gate, got {new_gate}")
+        raise InvalidField("new_gate", f"expected None without a gate, got {new_gate}")
     if is_concrete((gate, new_gate)) and not new_gate >= gate:
-        reason = f"expected new_gate >= gate = {gate}, got {new_gate}"
-        raise InvalidField(owner, "new_gate", reason)
+        raise InvalidField("new_gate", f"expected at least gate = {gate}, got {new_gate}")
 
 
 def within_gate(pairs: Pairs, gate: Number | None) -> Bool[Array, "M N"]:
@@ -109,7 +108,7 @@ class Nearest:
     compatible with one"""
 
     def __post_init__(self) -> None:
-        check_new_gate("Nearest", self.gate, self.new_gate)
+        check_new_gate(self.gate, self.new_gate)
 
     def __call__(self, prediction: Prediction, scan: Scan) -> Association:
         pairs = prediction.pairs(scan)
@@ -137,7 +136,7 @@ class MaximumLikelihood:
     new_gate: Number | None = field(default=None, check=gate_probability)
 
     def __post_init__(self) -> None:
-        check_new_gate("MaximumLikelihood", self.gate, self.new_gate)
+        check_new_gate(self.gate, self.new_gate)
 
     def __call__(self, prediction: Prediction, scan: Scan) -> Association:
         pairs = prediction.pairs(scan)
@@ -163,7 +162,7 @@ class GlobalNearest:
     new_gate: Number | None = field(default=None, check=gate_probability)
 
     def __post_init__(self) -> None:
-        check_new_gate("GlobalNearest", self.gate, self.new_gate)
+        check_new_gate(self.gate, self.new_gate)
 
     def __call__(self, prediction: Prediction, scan: Scan) -> Association:
         pairs = prediction.pairs(scan)

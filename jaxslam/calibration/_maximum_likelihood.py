@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 from numpy.typing import ArrayLike
 
-from jaxslam.core._numbers import check_count
 from jaxslam.core._record import as_record
 from jaxslam.core.types import Info, Log, Status
+from jaxslam.core.validation import InvalidField, at_least, positive, refusals_of, require
 
 _BOUND = 1.35
 """The fall of log L at the 95 % upper limit of a parameter whose estimate is 0: half the 0.90
@@ -246,9 +246,10 @@ def fit_noise(
         ValueError: on parameters that are not finite, or deviations not above 0; where a run fuses
             nothing or its likelihood is not finite; where other measurements are fused at other p.
     """
-    first, begin, logged, labels = _check_start(
-        start, guess, names, deviation, iterations, tolerance
-    )
+    with refusals_of("fit_noise"):
+        require("iterations", iterations, at_least(1))
+        require("tolerance", tolerance, positive)
+        first, begin, logged, labels = _check_start(start, guess, names, deviation)
 
     of_run = as_record(info)
 
@@ -264,14 +265,15 @@ def fit_noise(
         point = try_point(q)
         where = f"at parameters {_parameters(q, logged)}"
         if not point.dof:
-            raise ValueError(f"fit_noise: expected fused measurements, got none {where}")
+            raise InvalidField("info", f"expected fused measurements, got none {where}")
         if not (np.isfinite(point.value) and np.isfinite(point.gradient).all()):
-            raise ValueError(f"fit_noise: the likelihood or its gradient is not finite {where}")
+            raise InvalidField("info", f"the likelihood or its gradient is not finite {where}")
         return point
 
-    before = evaluate(_coordinates(first, logged))
-    point = before if guess is None else evaluate(_coordinates(begin, logged))
-    _check_same(before, point, logged)
+    with refusals_of("fit_noise"):
+        before = evaluate(_coordinates(first, logged))
+        point = before if guess is None else evaluate(_coordinates(begin, logged))
+        _check_same(before, point, logged)
     path = [point.q]
 
     def line_search(step: np.ndarray) -> _LikelihoodPoint | None:
@@ -286,7 +288,8 @@ def fit_noise(
 
     for _ in range(iterations):
         step, gain = _newton_step(point.expected, point, logged)
-        higher = line_search(step)
+        with refusals_of("fit_noise"):
+            higher = line_search(step)
         if higher is None:
             break
         point = higher
@@ -298,7 +301,8 @@ def fit_noise(
         step, gain = _newton_step(observed, point, logged)
         if gain <= tolerance:
             break
-        higher = line_search(step)
+        with refusals_of("fit_noise"):
+            higher = line_search(step)
         if higher is None:
             break
         point = higher
@@ -411,33 +415,29 @@ def _check_start(
     guess: ArrayLike | None,
     names: Sequence[str] | None,
     deviation: Sequence[bool] | None,
-    iterations: int,
-    tolerance: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[str, ...]]:
-    """Start, guess, which parameters are deviations, and names; ValueError on invalid ones."""
+    """Start, guess, which parameters are deviations, and names; InvalidField on invalid ones."""
     first = np.atleast_1d(np.asarray(start, np.float64))
     begin = first if guess is None else np.atleast_1d(np.asarray(guess, np.float64))
     logged = np.ones(first.shape, bool) if deviation is None else np.asarray(deviation, bool)
     labels = tuple(names or (f"p{i}" for i in range(first.size)))
     for argument, p in (("start", first), ("guess", begin)):
         if p.ndim != 1 or not p.size or not np.isfinite(p).all() or p.shape != first.shape:
-            raise ValueError(f"fit_noise: expected a {argument} of shape (P,), finite, got {p}")
+            raise InvalidField(argument, f"expected shape (P,), finite, got {p}")
         if logged.shape != p.shape or len(labels) != p.size:
-            raise ValueError(f"fit_noise: expected {p.size} names and deviations, as the start")
+            raise InvalidField("names, deviation", f"expected {p.size} of each, as the start has")
         if (p[logged] <= 0).any():
-            raise ValueError(f"fit_noise: expected standard deviations above 0, got {p}")
-    check_count("fit_noise: iterations", iterations)
-    if not tolerance > 0:
-        raise ValueError(f"fit_noise: expected a tolerance above 0, got {tolerance}")
+            raise InvalidField(argument, f"expected standard deviations above 0, got {p}")
     return first, begin, logged, labels
 
 
 def _check_same(before: _LikelihoodPoint, after: _LikelihoodPoint, logged: np.ndarray) -> None:
-    """Raise ValueError where other measurements are fused at one point than at another."""
+    """Raise InvalidField where other measurements are fused at one point than at another."""
     if before.dof != after.dof:
         p, q = (_parameters(point.q, logged) for point in (before, after))
-        raise ValueError(
-            f"fit_noise: expected the same measurements at all parameters, got {before.dof} fused "
-            f"components at {p} and {after.dof} at {q}: take a filter without a gate and with "
-            "known identities (as_associated)"
+        raise InvalidField(
+            "info",
+            f"expected the same measurements at all parameters, got {before.dof} fused components "
+            f"at {p} and {after.dof} at {q}: take a filter without a gate and with known "
+            "identities (as_associated)",
         )

@@ -11,11 +11,19 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 from numpy.typing import ArrayLike
 
-from jaxslam.core._numbers import check_count, is_concrete
+from jaxslam.core._numbers import is_concrete
 from jaxslam.core._record import as_record
+from jaxslam.core._reprs import describe
 from jaxslam.core.types import Info, Status
+from jaxslam.core.validation import (
+    InvalidField,
+    at_least,
+    covariance,
+    positive,
+    refusals_of,
+    require,
+)
 from jaxslam.math import _linalg as linalg
-from jaxslam.math._definite import asymmetric, indefinite
 
 
 class Calibration(NamedTuple):
@@ -76,11 +84,11 @@ def calibrate(
             distinguish the parameters.
     """
     p = np.atleast_1d(np.asarray(start, np.float64))
-    if p.ndim != 1 or not p.size or not np.isfinite(p).all():
-        raise ValueError(f"calibrate: expected a start of shape (P,), finite, got {start!r}")
-    check_count("calibrate: iterations", iterations)
-    if not tolerance > 0:
-        raise ValueError(f"calibrate: expected a tolerance above 0, got {tolerance}")
+    with refusals_of("calibrate"):
+        if p.ndim != 1 or not p.size or not np.isfinite(p).all():
+            raise InvalidField("start", f"expected shape (P,), finite, got {start!r}")
+        require("iterations", iterations, at_least(1))
+        require("tolerance", tolerance, positive)
 
     of_run = as_record(info)
     path, misfit, dofs, converged = [p], [], [], False
@@ -89,22 +97,25 @@ def calibrate(
         # A run hands derivatives on from step to step, which leaves half of the digits.
         rounding = np.sqrt(np.finfo(jacobian.dtype).eps)
         jacobian, w, dof = np.asarray(jacobian, np.float64), np.asarray(w, np.float64), int(dof)
+        fault = ""
         if not dof:
-            raise ValueError(
-                f"calibrate: expected fused measurements, got none at parameters {p}: start "
-                "closer, or with a larger gate"
+            fault = (
+                f"expected fused measurements, got none at parameters {p}: start closer, or with a "
+                "larger gate"
             )
-        if not (np.isfinite(jacobian).all() and np.isfinite(w).all()):
-            raise ValueError(
-                f"calibrate: the innovations or their derivatives are not finite at parameters {p}"
-            )
+        elif not (np.isfinite(jacobian).all() and np.isfinite(w).all()):
+            fault = f"the innovations or their derivatives are not finite at parameters {p}"
+        if fault:
+            raise InvalidField("info", fault, owner="calibrate")
         # Columns of unit length: whether parameters can be distinguished does not depend on units.
         length = np.linalg.norm(jacobian, axis=0)
         left, values, right = np.linalg.svd(jacobian / np.where(length > 0, length, 1.0), False)
         if values[-1] <= len(p) * rounding * values[0]:
-            raise ValueError(
-                f"calibrate: the log does not determine all parameters at {p}: fix one, or use a "
-                "log with more motion"
+            raise InvalidField(
+                "info",
+                f"the log does not determine all parameters at {p}: fix one, or use a log with "
+                "more motion",
+                owner="calibrate",
             )
         # J⁺ = V Σ⁻¹ Uᵀ without Uᵀ, in the units of the parameters; (JᵀJ)⁻¹ is its square.
         inverse = right.T / values / length[:, None]
@@ -184,33 +195,22 @@ def consider_cov(
             another size, or that is none; on a result that is no array (*shape, n) of real numbers,
             or that is not finite at p, itself or its derivatives.
     """
-    if not callable(result):
-        raise ValueError(
-            f"consider_cov: expected result to be a function of p, got {type(result).__name__}"
-        )
-    if not (is_concrete(parameters) and is_concrete(cov)):
-        raise ValueError("consider_cov: computes on the host; call it outside jit, vmap and grad")
-    p = np.atleast_1d(np.asarray(parameters, np.float64))
-    if p.ndim != 1 or not p.size or not np.isfinite(p).all():
-        raise ValueError(
-            f"consider_cov: expected parameters of shape (P,), finite, got {parameters!r}"
-        )
-    c = np.asarray(cov, np.float64)
-    c = c.reshape(1, 1) if c.ndim == 0 and p.size == 1 else c
-    if c.shape != (p.size, p.size):
-        raise ValueError(
-            f"consider_cov: expected a covariance of shape {(p.size, p.size)}, got one of {c.shape}"
-        )
-    if not np.isfinite(c).all():
-        raise ValueError("consider_cov: expected a covariance, got one that is not finite")
-    if asymmetric(c, 1e-6):  # written with six digits
-        raise ValueError("consider_cov: expected a covariance, got one that is not symmetric")
-    if indefinite(c, 1e-6):
-        raise ValueError("consider_cov: expected a covariance, got one with a negative eigenvalue")
+    with refusals_of("consider_cov"):
+        if not callable(result):
+            raise InvalidField("result", f"expected a function of p, got {describe(result)}")
+        if not (is_concrete(parameters) and is_concrete(cov)):
+            raise InvalidField("", "computes on the host; call it outside jit, vmap and grad")
+        p = np.atleast_1d(np.asarray(parameters, np.float64))
+        if p.ndim != 1 or not p.size or not np.isfinite(p).all():
+            raise InvalidField("parameters", f"expected shape (P,), finite, got {parameters!r}")
+        c = np.asarray(cov, np.float64)
+        c = c.reshape(1, 1) if c.ndim == 0 and p.size == 1 else c
+        require("cov", c, covariance(p.size))
 
     jacobians, values = jax.device_get(_differentiate(as_record(result), p))
     if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((jacobians, values))):
-        raise ValueError(f"consider_cov: the result or its derivatives at {p} are not finite")
+        reason = f"the result or its derivatives at {p} are not finite"
+        raise InvalidField("result", reason, owner="consider_cov")
 
     def propagate(jacobian: np.ndarray) -> np.ndarray:
         jacobian = np.asarray(jacobian, np.float64)

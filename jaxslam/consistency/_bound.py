@@ -13,6 +13,7 @@ from jaxslam._driver import run
 from jaxslam.consistency._run_scores import snapshot_steps
 from jaxslam.core.protocols import Sensor
 from jaxslam.core.types import Estimate, Log, Truth
+from jaxslam.core.validation import InvalidField, refusals_of
 from jaxslam.filters._ekf.ekf_slam import EkfSlam
 from jaxslam.linearize import _first_order as first_order
 from jaxslam.linearize._first_order import with_lever_arm
@@ -75,16 +76,16 @@ def posterior_bound(
             measurement noise that is singular.
     """
     is_single = isinstance(scenario, Scenario | RecordedWorld)
-    if not is_single or scenario.spurious is not None:
-        raise ValueError(
-            "posterior_bound: expected a scenario of one robot without spurious measurements"
-        )
-    if np.ndim(truth.pose) != 3 or np.shape(log.control)[:2] != np.shape(truth.pose)[:2]:
-        raise ValueError("posterior_bound: expected truth and log with a leading axis over runs")
-    count, total = truth.pose.shape[:2]
-    at = snapshot_steps(total) if steps is None else np.asarray(steps, int)
-    if at.size == 0 or at.min() < 0 or at.max() >= total:
-        raise ValueError(f"posterior_bound: expected steps from 0 to {total - 1}, got {steps}")
+    with refusals_of("posterior_bound"):
+        if not is_single or scenario.spurious is not None:
+            reason = "expected one of a single robot without spurious measurements"
+            raise InvalidField("scenario", reason)
+        if np.ndim(truth.pose) != 3 or np.shape(log.control)[:2] != np.shape(truth.pose)[:2]:
+            raise InvalidField("truth, log", "expected a leading axis over runs")
+        count, total = truth.pose.shape[:2]
+        at = snapshot_steps(total) if steps is None else np.asarray(steps, int)
+        if at.size == 0 or at.min() < 0 or at.max() >= total:
+            raise InvalidField("steps", f"expected numbers from 0 to {total - 1}, got {steps}")
     runs = jax.device_get(jax.jit(jax.vmap(partial(jacobians_at_truth, scenario)))(truth, log))
     start = np.asarray(jax.jit(root_psd)(jnp.asarray(scenario.pose_cov, truth.pose.dtype)))
     by_p: np.ndarray = np.zeros(())

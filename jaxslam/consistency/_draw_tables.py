@@ -66,19 +66,19 @@ def check_tables(world: World) -> None:
     owner, sensor = f"{type(world).__name__} {world.name!r}", world.sensor
     if isinstance(world, TeamWorld):
         reason = f"expected one robot, which a folder of tables has, got {len(world.robots)}"
-        raise InvalidField(owner, "robots", reason)
+        raise InvalidField("robots", reason, owner=owner)
     if isinstance(sensor, Suite):
         reason = (
             "expected one sensor, which a folder of tables has, got a suite of "
             f"{', '.join(part.sensor.name for part in sensor.parts)}"
         )
-        raise InvalidField(owner, "sensor", reason)
+        raise InvalidField("sensor", reason, owner=owner)
     if sensor.landmark and not sensor.of_points and not sensor.landmark[0].startswith("x"):
         reason = (
             "expected landmarks that are points, as landmarks.csv has them, got "
             f"({', '.join(sensor.landmark)}) of {sensor.name}"
         )
-        raise InvalidField(owner, "sensor", reason)
+        raise InvalidField("sensor", reason, owner=owner)
 
 
 def has_unknown_tags(world: World) -> bool:
@@ -114,7 +114,8 @@ def odometry_of(world: World, control: ArrayLike) -> Odometry:
     if not (dt[at_scan:] > 0).all():
         row = int(np.flatnonzero(~(dt > 0))[at_scan])
         reason = f"expected intervals above 0, which lines of a table have, got {dt[row]:g}"
-        raise InvalidField(f"{type(world).__name__} {world.name!r}", f"controls, row {row}", reason)
+        owner = f"{type(world).__name__} {world.name!r}"
+        raise InvalidField(f"controls, row {row}", reason, owner=owner)
     even = np.ptp(dt[at_scan:]) == 0
     after = dt[-1] * np.arange(1 - at_scan, len(dt) + 1 - at_scan) if even else np.cumsum(dt)
     names = tuple(name for name in controls if name != INTERVAL)

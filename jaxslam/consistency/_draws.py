@@ -25,10 +25,15 @@ from jaxslam.consistency._draw_tables import (
     run_files,
     truth_files,
 )
-from jaxslam.core._numbers import check_count, check_key
-from jaxslam.core._validation import check_record
 from jaxslam.core.types import Log, Truth
-from jaxslam.core.validation import InvalidField
+from jaxslam.core.validation import (
+    InvalidField,
+    at_least,
+    instance_of,
+    prng_key,
+    refusals_of,
+    require,
+)
 from jaxslam.simulation._worlds import BLOCK, World, draw_block
 
 RECORD = "draws.json"
@@ -55,7 +60,8 @@ def draws(world: World, runs: int, key: jax.Array) -> Iterator[tuple[Truth, Log]
 
     Raises ValueError on another world, runs below 1, more runs than are recorded, and no PRNG key.
     """
-    _check("draws", world, runs, key)
+    with refusals_of("draws"):
+        _check(world, runs, key)
     return (history for _, history in _histories(world, range(runs), key))
 
 
@@ -94,8 +100,9 @@ def write_draws(
         ValueError: on a world whose logs no table holds (teams, suites of sensors, lines), as
             `draws` does, and on a folder that holds other draws, by what differs, or other files.
     """
-    _check("write_draws", world, runs, key)
-    check_tables(world)
+    with refusals_of("write_draws"):
+        _check(world, runs, key)
+        check_tables(world)
     odometry = odometry_of(world, world.controls)
     folder = Path(folder)
     campaign = _identity(world, key)
@@ -128,13 +135,13 @@ def write_draws(
     return [folder / "runs" / name for name in names]
 
 
-def _check(caller: str, world: World, runs: int, key: jax.Array) -> None:
-    check_record(caller, "world", world, World)
-    check_count(f"{caller}: runs", runs)
-    check_key(caller, key)
+def _check(world: World, runs: int, key: jax.Array) -> None:
+    require("world", world, instance_of(World))
+    require("runs", runs, at_least(1))
+    require("key", key, prng_key)
     if (most := world.recorded_runs) is not None and runs > most:
         reason = f"expected at most {most}, the recorded runs of {world.name}, got {runs}"
-        raise InvalidField(caller, "runs", reason)
+        raise InvalidField("runs", reason)
 
 
 def _histories(

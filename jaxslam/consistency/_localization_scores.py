@@ -12,10 +12,18 @@ from numpy.typing import ArrayLike
 from jaxslam._driver import run
 from jaxslam.consistency._intervals import LEVEL, Average, interval, positive_interval
 from jaxslam.consistency._measures.nees import block_nees, pose_error
-from jaxslam.core._numbers import check_count, check_covariance, check_key
 from jaxslam.core._reprs import short_repr
 from jaxslam.core.protocols import Filter
 from jaxslam.core.types import JaxOrNumPy, Log
+from jaxslam.core.validation import (
+    InvalidField,
+    at_least,
+    covariance,
+    instance_of,
+    prng_key,
+    refusals_of,
+    require,
+)
 from jaxslam.filters._particles.pose_particles import PoseParticles
 from jaxslam.laser.grids._grid_localization import beam_log
 from jaxslam.math._linalg import root_psd
@@ -99,17 +107,15 @@ def judge_localization(
     Raises:
         ValueError: a world, a filter, a key, a covariance or a number that is none.
     """
-    if not isinstance(world, LaserWorld):
-        got = type(world).__name__
-        raise ValueError(f"judge_localization: expected a LaserWorld, got {got}")
-    if not isinstance(filter, Filter):
-        raise ValueError(f"judge_localization: expected a Filter, got {type(filter).__name__}")
-    check_count("judge_localization: runs", runs)
-    check_count("judge_localization: stride", stride)
-    if stride > (steps := len(np.asarray(world.controls))):
-        raise ValueError(f"judge_localization: expected stride <= {steps} steps, got {stride}")
-    check_key("judge_localization", key)
-    check_covariance("judge_localization: start_cov", start_cov, 3)
+    with refusals_of("judge_localization"):
+        require("world", world, instance_of(LaserWorld))
+        require("filter", filter, instance_of(Filter))
+        require("runs", runs, at_least(1))
+        require("stride", stride, at_least(1))
+        if stride > (steps := len(np.asarray(world.controls))):
+            raise InvalidField("stride", f"expected at most the {steps} steps, got {stride}")
+        require("key", key, prng_key)
+        require("start_cov", start_cov, covariance(3))
     key_log, key_start, key_filter = jax.random.split(key, 3)
     logs = jnp.broadcast_to(key_log, (runs, *key_log.shape)) if same_log else None
     keys = (
@@ -244,7 +250,11 @@ def summarize_localization(
     scores = LocalizationScores(*(np.asarray(part) for part in scores))
     steps = scores.level.shape[1]
     if not 0 <= skip < steps:
-        raise ValueError(f"summarize_localization: expected skip from 0 to {steps - 1}, got {skip}")
+        raise InvalidField(
+            "skip",
+            f"expected a number from 0 to {steps - 1}, got {skip}",
+            owner="summarize_localization",
+        )
     error = pose_error(scores.truth, scores.pose)  # type: ignore[arg-type]
     off = np.hypot(error[..., 0], error[..., 1])
     wrong = (off >= limit[0]) | (np.abs(error[..., 2]) >= limit[1])

@@ -13,7 +13,7 @@ import numpy as np
 
 from jaxslam.core._names import unfit_signature
 from jaxslam.core._reprs import describe, with_article
-from jaxslam.core.validation import Check, InvalidField, require
+from jaxslam.core.validation import Check, InvalidField, refusals_of, require
 
 _T = TypeVar("_T")
 
@@ -44,8 +44,9 @@ def record(cls: type[_T]) -> type[_T]:
     `dataclasses.replace` changes fields, and checks them again.
 
     A record that is made by its class first checks each field by the field's `check`, then runs
-    `__post_init__`, for what is between fields, then refuses fields of another kind. JAX rebuilds
-    records without any check, since it fills them with tracers, stacks and derivatives.
+    `__post_init__`, for what is between fields, then refuses fields of another kind. An
+    InvalidField raised there needs no owner: it is the class. JAX rebuilds records without any
+    check, since it fills them with tracers, stacks and derivatives.
 
     Raises InvalidField, a ValueError, at construction.
     """
@@ -53,14 +54,15 @@ def record(cls: type[_T]) -> type[_T]:
 
     def __post_init__(self: Any) -> None:
         checked = type(self) is cls  # not where a subclass calls super().__post_init__()
-        if checked:
-            _check_declared(self, checks)
-        elif "__dataclass_fields__" not in type(self).__dict__:
-            raise InvalidField(type(self).__name__, "", "expected @record above the class")
-        if between_fields is not None:
-            between_fields(self)
-        if checked:
-            _check_kinds(self)
+        with refusals_of(type(self).__name__):
+            if checked:
+                _check_declared(self, checks)
+            elif "__dataclass_fields__" not in type(self).__dict__:
+                raise InvalidField("", "expected @record above the class")
+            if between_fields is not None:
+                between_fields(self)
+            if checked:
+                _check_kinds(self)
 
     cls.__post_init__ = __post_init__  # type: ignore[attr-defined]
     cls.__setstate__ = _set_state  # type: ignore[attr-defined]
@@ -135,7 +137,7 @@ def check_field(record: Any, name: str, check: Check) -> None:
     """Check a field in `__post_init__`: where the check follows from other fields, or the field is
     declared by subclasses, None without one."""
     value = getattr(record, name, None)
-    result = require(type(record).__name__, name, value, check)
+    result = require(name, value, check)
     if result is not value:
         set_field(record, name, result)
 
@@ -179,7 +181,7 @@ def _check_declared(self: Any, checks: dict[str, Check]) -> None:
     for field in dataclasses.fields(self):
         if field.metadata.get("static") and _is_array(getattr(self, field.name)):
             # Before its check, in which == of an array would be an array.
-            raise InvalidField(type(self).__name__, field.name, _ARRAY)
+            raise InvalidField(field.name, _ARRAY)
         if field.name in checks:
             check_field(self, field.name, checks[field.name])
 
@@ -189,42 +191,38 @@ def _check_kinds(self: Any) -> None:
     for field in dataclasses.fields(self):
         value = getattr(self, field.name)
         check = _check_static if field.metadata.get("static") else _check_data
-        check(type(self).__name__, field.name, value)
+        check(field.name, value)
 
 
 _ARRAY = "expected a value that is compared by ==, got an array"
 
 
-def _check_static(owner: str, name: str, value: Any) -> None:
+def _check_static(field: str, value: Any) -> None:
     """Refuse a value that may change, or holds numbers to differentiate by."""
     if isinstance(value, tuple | frozenset):
         for entry in value:
-            _check_static(owner, name, entry)
+            _check_static(field, entry)
     elif _is_array(value):
-        raise InvalidField(owner, name, _ARRAY)
+        raise InvalidField(field, _ARRAY)
     elif is_record(value) and jax.tree.leaves(value):
         got = f"the record {type(value).__name__}, whose numbers belong in a field of data"
-        raise InvalidField(owner, name, f"expected a choice, a size or a function, got {got}")
+        raise InvalidField(field, f"expected a choice, a size or a function, got {got}")
     elif type(value).__hash__ is None:
         got = with_article(type(value).__name__)
-        reason = f"expected a value that cannot change, as a tuple, got {got}"
-        raise InvalidField(owner, name, reason)
+        raise InvalidField(field, f"expected a value that cannot change, as a tuple, got {got}")
 
 
-def _check_data(owner: str, name: str, value: Any) -> None:
+def _check_data(field: str, value: Any) -> None:
     """Refuse text, lists, functions and classes."""
     if type(value) is tuple:
         for k, entry in enumerate(value):
-            _check_data(owner, f"{name}[{k}]", entry)
+            _check_data(f"{field}[{k}]", entry)
     elif isinstance(value, list):
-        reason = "expected an array, as of numpy.asarray, got a list"
-        raise InvalidField(owner, name, reason)
+        raise InvalidField(field, "expected an array, as of numpy.asarray, got a list")
     elif isinstance(value, str | Sequence | set | type) and not isinstance(value, tuple):
-        raise InvalidField(owner, name, f"expected {_DATA}, got {describe(value)}")
+        raise InvalidField(field, f"expected {_DATA}, got {describe(value)}")
     elif jax.tree_util.all_leaves([value]) and not _is_number(value):
-        raise InvalidField(
-            owner, name, f"expected {_DATA}, got {with_article(type(value).__name__)}"
-        )
+        raise InvalidField(field, f"expected {_DATA}, got {with_article(type(value).__name__)}")
 
 
 def _is_array(value: Any) -> bool:
@@ -238,25 +236,17 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, np.ndarray) and value.dtype.kind in "biufcV"
 
 
-# --- for worlds, which do not declare their checks ------------------------------------------------
-
-
 class FrozenDict(dict[Any, Any]):
     """A dict that hashes, as a static field needs; do not change it."""
 
     @classmethod
-    def of(cls, name: str, value: Mapping[Any, Any]) -> "FrozenDict":
-        """A dict, and those in it, frozen; ValueError, which begins with the name, on an array."""
-        frozen = {k: cls.of(name, v) if isinstance(v, Mapping) else v for k, v in value.items()}
+    def of(cls, value: Mapping[Any, Any]) -> "FrozenDict":
+        """A dict, and those in it, frozen; ValueError, which begins with the key, on an array."""
+        frozen = {key: cls.of(v) if isinstance(v, Mapping) else v for key, v in value.items()}
         for key, entry in frozen.items():
             if isinstance(entry, np.ndarray | jax.Array | list):
-                raise ValueError(f"{name}: {key}: expected a value that is compared by ==")
+                raise ValueError(f"{key}: expected a value that is compared by ==")
         return cls(frozen)
 
     def __hash__(self) -> int:  # type: ignore[override]
         return hash(frozenset(self.items()))
-
-
-def hold_function(of: Any, name: str, parameters: str) -> None:
-    """Check a function in `__post_init__`; in its place `field(check=function_of(...))`."""
-    check_field(of, name, function_of(*parameters.split(", ")))

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
+from numpy.typing import ArrayLike
 
 from jaxslam.math._arrays import is_concrete
 
@@ -62,8 +63,22 @@ def describe(value: object) -> str:
     return with_article(type(value).__name__)
 
 
+def shape_text(value: ArrayLike) -> str:
+    """The shape of an array, or the type of anything else, for an error message."""
+    try:
+        shape = np.shape(value)
+    except ValueError:
+        return "rows of unlike lengths"
+    if shape == () and not hasattr(value, "shape"):
+        plain = value is None or isinstance(value, str | int | float | complex)
+        return repr(value) if plain else with_article(type(value).__name__)
+    return str(shape)
+
+
 def with_article(noun: str) -> str:
-    """The noun with its article: "an EkfSlam", "a Motion", "a Unicycle", "an Unscented"."""
+    """The noun with its article: "an EkfSlam", "a Unicycle", "an Unscented"; "Points" has none."""
+    if noun.endswith("s") and not noun.endswith(("ss", "us", "is")):
+        return noun
     vowel = noun[:1] in "AEIOaeio" or (noun[:2] in ("Un", "un") and noun[2:3] != "i")
     return f"{'an' if vowel or noun == 'ndarray' else 'a'} {noun}"
 

@@ -27,7 +27,6 @@ class Constant:
         if np.ndim(self.cov) > 2:
             raise InvalidField(
                 "noise_cov",
-                "",
                 f"expected a covariance (n, n), got {np.shape(self.cov)}: a stack of filters or "
                 "worlds goes through jax.vmap, as "
                 "jax.vmap(run, in_axes=(0, None, None, None, None))(stack, …)",

@@ -31,6 +31,7 @@ from jaxslam.core.validation import (
     mounting_pose,
     names,
     or_none,
+    refusals_of,
     require,
 )
 from jaxslam.math import se2
@@ -89,9 +90,8 @@ class Component:
             cls.name = _lower(cls)
 
     def __init__(self, *_: object, **__: object) -> None:  # a record has a constructor of its own
-        raise InvalidField(
-            type(self).__name__, "", "expected @record above the class, of jaxslam.core.record"
-        )
+        reason = "expected @record above the class, of jaxslam.core.record"
+        raise InvalidField("", reason, owner=type(self).__name__)
 
     def _check(self, base: type, methods: Mapping[str, str]) -> None:
         """Check that a subclass of `base` defines methods of these parameters.
@@ -100,13 +100,13 @@ class Component:
         """
         for name, parameters in methods.items():
             if getattr(type(self), name) is getattr(base, name):
-                raise InvalidField(type(self).__name__, name, "expected a method, got none")
+                raise InvalidField(name, "expected a method, got none")
             if not parameters:
                 continue
             signature = unfit_signature(getattr(self, name), parameters.count(",") + 1)
             if signature is not None:
                 reason = f"expected a method of ({parameters}), got one of {signature}"
-                raise InvalidField(type(self).__name__, name, reason)
+                raise InvalidField(name, reason)
 
     def _check_names(self, *fields: str) -> None:
         """Check that fields are tuples of names."""
@@ -118,23 +118,24 @@ class Component:
 class _CovarianceFunction(Function):
     """A plain function that returns a covariance, which is checked where its numbers are known."""
 
-    owner: str = static()
+    model: str = static()
     """the class of the model"""
     size: int = static()
 
     def __call__(self, *arguments: Array) -> Array:
-        cov = require(self.owner, "noise_cov", self.function(*arguments), covariance(self.size))
+        with refusals_of(self.model):
+            cov = require("noise_cov", self.function(*arguments), covariance(self.size))
         return jnp.asarray(cov, arguments[0].dtype)
 
 
-def _noise_of(owner: str, size: int) -> Check:
+def _noise_of(model: type, size: int) -> Check:
     """The check of a model's noise_cov (size, size), which it makes a record that can be called."""
 
     def check(value: NoiseCov) -> object:
         if is_record(value):
             return value
         if callable(value):
-            return _CovarianceFunction(value, owner, size)
+            return _CovarianceFunction(value, model.__name__, size)
         return Constant(covariance(size)(value))
 
     return check
@@ -158,10 +159,10 @@ class Model(Component):
         self._check(base, dict.fromkeys(methods, ""))
         self._check_names(*named)
         if not hasattr(self, "noise_cov"):
-            raise InvalidField(type(self).__name__, "noise_cov", "expected a field or a method")
+            raise InvalidField("noise_cov", "expected a field or a method")
         if "noise_cov" in self.__dict__:
             size = len(getattr(self, named[-1]))
-            check_field(self, "noise_cov", _noise_of(type(self).__name__, size))
+            check_field(self, "noise_cov", _noise_of(type(self), size))
 
 
 class Motion(Model):

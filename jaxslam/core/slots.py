@@ -276,7 +276,7 @@ def remove(joint: Joint, dead: Array, *, square_root: bool = False) -> Joint:
     if jnp.shape(dead) != joint.alive.shape or jnp.result_type(dead) != jnp.bool_:
         got = f"{jnp.result_type(dead)} of {jnp.shape(dead)}"
         reason = f"expected bool of shape {joint.alive.shape}, got {got}"
-        raise InvalidField("remove", "dead", reason)
+        raise InvalidField("dead", reason, owner="remove")
     size = joint.landmarks.shape[1]
     keep = jnp.concatenate([jnp.ones(3, bool), jnp.repeat(~dead, size)])
     eye = jnp.eye(joint.cov.shape[0], dtype=joint.cov.dtype)

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from jaxslam.core._reprs import describe, short_repr, text_of
 from jaxslam.core.logs import _streams as streams
 from jaxslam.core.logs import _tables as tables
-from jaxslam.core.validation import InvalidField
+from jaxslam.core.validation import InvalidField, refusals_of
 from jaxslam.math._arrays import is_concrete
 from jaxslam.math._pose_covariances import covariance_faults
 
@@ -158,52 +158,46 @@ class Log(NamedTuple):
                 may be in milliseconds or nanoseconds, and on jumps of a path of poses, as where
                 odometry was set to zero: the step before a jump takes its place.
         """
-        name, controls = "Log.from_records", motion.controls
-        moved = tables.columns_of(
-            f"{name}: odometry",
-            odometry,
-            lambda columns: (tables.TIME, *tables.odometry_columns(controls, columns)),
-        )
-        parts = getattr(sensor, "parts", None)  # of a suite
-        sources: list[tuple[str, PyTree, PyTree, int | None]] = []
-        if parts is None:
-            sources = [(f"{name}: measurements", sensor, measurements, None)]
-        else:
-            if not isinstance(measurements, Sequence) or len(measurements) != len(parts):
-                parts_text = ", ".join(part.sensor.name for part in parts)
-                raise InvalidField(
-                    name,
-                    "measurements",
-                    f"expected a table for each of the {len(parts)} sensors of the suite, "
-                    f"({parts_text}), got {describe(measurements)}",
-                )
-            if any(part.sees == "robots" for part in parts):
-                raise InvalidField(
-                    name,
-                    "sensor",
-                    "expected sensors of landmarks; of a team make the log of each robot by "
-                    "Log.from_streams, with the rows of all, and put them side by side",
-                )
-            sources = [
-                (
-                    f"{name}: measurements[{i}] of {part.sensor.name}",
-                    part.sensor,
-                    table,
-                    part.places,
-                )
-                for i, (part, table) in enumerate(zip(parts, measurements, strict=True))
-            ]
-        seen = []
-        for argument, model, source, places in sources:
-            names = tables.measurement_columns(model.measurements, model.landmark)
-            table = tables.columns_of(argument, source, lambda _, names=names: names)  # type: ignore[misc]
-            seen.append(tables.Seen(table, model.measurements, places))
+        controls, parts = motion.controls, getattr(sensor, "parts", None)  # parts of a suite
+        with refusals_of("Log.from_records"):
+            moved = tables.columns_of(
+                "odometry",
+                odometry,
+                lambda columns: (tables.TIME, *tables.odometry_columns(controls, columns)),
+            )
+            sources: list[tuple[str, PyTree, PyTree, int | None]] = []
+            if parts is None:
+                sources = [("measurements", sensor, measurements, None)]
+            else:
+                if not isinstance(measurements, Sequence) or len(measurements) != len(parts):
+                    parts_text = ", ".join(part.sensor.name for part in parts)
+                    raise InvalidField(
+                        "measurements",
+                        f"expected a table for each of the {len(parts)} sensors of the suite, "
+                        f"({parts_text}), got {describe(measurements)}",
+                    )
+                if any(part.sees == "robots" for part in parts):
+                    raise InvalidField(
+                        "sensor",
+                        "expected sensors of landmarks; of a team make the log of each robot by "
+                        "Log.from_streams, with the rows of all, and put them side by side",
+                    )
+                sources = [
+                    (f"measurements[{i}] of {part.sensor.name}", part.sensor, table, part.places)
+                    for i, (part, table) in enumerate(zip(parts, measurements, strict=True))
+                ]
+            seen = []
+            for argument, model, source, places in sources:
+                names = tables.measurement_columns(model.measurements, model.landmark)
+                table = tables.columns_of(argument, source, lambda _, names=names: names)  # type: ignore[misc]
+                seen.append(tables.Seen(table, model.measurements, places))
         for table in (moved, *(part.table for part in seen)):
             for sign in tables.wrong_units(table):
                 warnings.warn(f"{sign} in the column's name", stacklevel=2)
         if jump := tables.replace_jumps(moved):
             warnings.warn(jump, stacklevel=2)
-        rows, tags, dropped = tables.align_tables(moved, seen, controls)
+        with refusals_of("Log.from_records"):
+            rows, tags, dropped = tables.align_tables(moved, seen, controls)
         return Recording(cls.from_rows(rows), rows.time, tags, dropped)
 
     def __repr__(self) -> str:
@@ -318,8 +312,8 @@ class Trace(NamedTuple):
         Of the values of one run or of many, outside of a trace (else ValueError).
         """
         if not is_concrete(self.estimate, self.info):
-            raise ValueError(
-                "Trace.doubts: it needs values: use it outside of jax.jit and jax.vmap"
+            raise InvalidField(
+                "doubts", "it needs values: use it outside of jax.jit and jax.vmap", owner="Trace"
             )
         estimate, info = jax.device_get((self.estimate, self.info))
         pose, cov = np.asarray(estimate.pose), np.asarray(estimate.pose_cov)

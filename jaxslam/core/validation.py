@@ -2,8 +2,14 @@
 
 A check is a function of a value. It returns the value, or its converted form where several forms
 are accepted, and raises ValueError with the reason alone. Beside a field (`core.record.field`,
-`core.record.static`) the record adds its class and the field; for an argument `require` adds
-them. What JAX traces is checked for its shape and dtype alone.
+`core.record.static`) the record adds the field and its class. For an argument `require` adds the
+argument, and the public function, which opens `refusals_of` once around its checks, its name: no
+check takes the name of its caller. What JAX traces is checked for its shape and dtype alone.
+
+    with refusals_of("simulate"):
+        require("scenario", scenario, instance_of(World))
+        if late:
+            raise InvalidField("start", "expected …, got …")
 """
 
 import math
@@ -18,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxslam._public import publish
-from jaxslam.core._reprs import describe, real_array, with_article
+from jaxslam.core._reprs import describe, real_array, shape_text, with_article
 from jaxslam.core._units import TURN
 from jaxslam.math._arrays import held_array, is_concrete
 from jaxslam.math._definite import asymmetric, indefinite
@@ -27,6 +33,7 @@ __all__ = [
     "Check",
     "InvalidField",
     "InvalidFile",
+    "array_of",
     "at_least",
     "covariance",
     "finite",
@@ -40,6 +47,8 @@ __all__ = [
     "positive",
     "prng_key",
     "probability",
+    "real",
+    "refusals_of",
     "require",
 ]
 
@@ -50,10 +59,10 @@ Check = Callable[[Any], Any]
 class InvalidField(ValueError):
     """A field of a record, or an argument of a function, that is not what was expected."""
 
-    def __init__(self, owner: str, field: str, reason: str) -> None:
-        super().__init__(owner, field, reason)
+    def __init__(self, field: str, reason: str, *, owner: str = "") -> None:
+        super().__init__(field, reason)
         self.owner = owner
-        """the class of the record, or the function"""
+        """the class of the record, or the function; "" until a `refusals_of` fills it in"""
         self.field = field
         """"" where the reason is about several"""
         self.reason = reason
@@ -87,14 +96,37 @@ class InvalidFile(ValueError):
         return ": ".join(part for part in (place, self.column, self.reason) if part)
 
 
-def require(owner: str, field: str, value: Any, check: Check) -> Any:
-    """The value as a check returns it; InvalidField, with owner and field, where it refuses."""
+class refusals_of:
+    """A context that fills in the owner of an InvalidField that has none.
+
+    owner: the function or command whose arguments are checked within. A class adds no frame to a
+    traceback, as a generator's context would.
+    """
+
+    def __init__(self, owner: str) -> None:
+        self.owner = owner
+
+    def __enter__(self) -> None: ...
+
+    def __exit__(self, kind: object, error: object, traceback: object) -> None:
+        if isinstance(error, InvalidField) and not error.owner:
+            error.owner = self.owner
+
+
+def require(field: str, value: Any, check: Check) -> Any:
+    """The value as a check returns it; InvalidField, with the field, where it refuses.
+
+    A field that is refused within the value is named as log.control.
+    """
     try:
         return check(value)
-    except InvalidField:  # of a record within, which names itself
-        raise
+    except InvalidField as error:
+        if error.owner:  # of a record within, which names itself
+            raise
+        inner = ".".join(part for part in (field, error.field) if part)
+        raise InvalidField(inner, error.reason) from error.__cause__
     except ValueError as error:
-        raise InvalidField(owner, field, str(error)) from None
+        raise InvalidField(field, str(error)) from None
 
 
 def _shape(value: Any) -> tuple[int, ...] | None:
@@ -207,6 +239,40 @@ def probability(value: Any) -> Any:
             hint = f" (the χ² quantile {number:g} of 2 degrees of freedom is that of {p})"
         raise ValueError(f"expected a probability above 0 and below 1, as 0.999, got {value}{hint}")
     raise ValueError(f"expected a probability above 0 and below 1, as 0.999, got {describe(value)}")
+
+
+def real(value: Any) -> Any:
+    """The check of a real number, or of an array of them; a bool counts as a number."""
+    if is_concrete(value):
+        try:
+            dtype = np.asarray(value).dtype
+        except (TypeError, ValueError):  # a key; rows of unlike lengths
+            dtype = np.dtype(object)
+        if not any(jnp.issubdtype(dtype, kind) for kind in (np.integer, np.floating, np.bool_)):
+            got = repr(value) if isinstance(value, tuple | list) else describe(value)
+            raise ValueError(f"expected real numbers, got {got}")
+    return value
+
+
+def array_of(*shape: int | str, kind: type = np.generic) -> Check:
+    """The check of an array of this shape, in which a letter is any size, and of this kind."""
+
+    def check(value: Any) -> Any:
+        got = shape_text(value)
+        sizes = np.shape(value) if got.startswith("(") else ()
+        if len(sizes) != len(shape) or any(
+            isinstance(n, int) and n != m for n, m in zip(shape, sizes, strict=True)
+        ):
+            expected = ", ".join(map(str, shape)) + "," * (len(shape) == 1)
+            raise ValueError(f"expected shape ({expected}), got {got}")
+        if not hasattr(value, "dtype"):
+            raise ValueError(f"expected an array, got {with_article(type(value).__name__)}")
+        dtype = jnp.result_type(value)
+        if not jnp.issubdtype(dtype, kind):
+            raise ValueError(f"expected {kind.__name__} values, got {dtype}")
+        return value
+
+    return check
 
 
 def finite(*shape: int, least: float = -math.inf) -> Check:

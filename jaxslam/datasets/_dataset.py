@@ -8,9 +8,10 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxslam.core._validation import check_log
+from jaxslam.core._validation import log_of
 from jaxslam.core.protocols import Motion, Sensor
 from jaxslam.core.types import Log
+from jaxslam.core.validation import InvalidField, refusals_of, require
 from jaxslam.sensors._suite import Suite
 from jaxslam.sensors._team import Robot
 
@@ -100,27 +101,20 @@ class Dataset:
     have the tags N, N+1, …; `motion` and `sensor` are those of the first robot."""
 
     def __post_init__(self) -> None:
-        check_log(
-            self.name,
-            self.log,
-            control_size=len(self.motion.controls),
-            measurement_size=len(self.sensor.measurements),
-            parts=self.sensor.places if isinstance(self.sensor, Suite) else (),
-        )
-        if np.shape(self.time) != (self.steps,):
-            raise ValueError(f"{self.name}: expected {self.steps} times, got {np.shape(self.time)}")
-        if np.max(self.log.scan.tag, initial=-1) >= self.capacity + len(self.robots):
-            raise ValueError(f"{self.name}: a tag is not below the capacity {self.capacity}")
-        if self.landmarks is not None and np.shape(self.landmarks) != (len(self.tags), 2):
-            raise ValueError(
-                f"{self.name}: expected landmarks of shape ({len(self.tags)}, 2), "
-                f"got {np.shape(self.landmarks)}"
-            )
-        if self.true_path is not None and np.shape(self.true_path) != (self.steps, 3):
-            raise ValueError(
-                f"{self.name}: expected a true path of shape ({self.steps}, 3), "
-                f"got {np.shape(self.true_path)}"
-            )
+        slots = self.sensor.places if isinstance(self.sensor, Suite) else ()
+        sizes = len(self.motion.controls), len(self.sensor.measurements)
+        with refusals_of(self.name):
+            require("log", self.log, log_of(*sizes, slots))
+            for field, shape in (
+                ("time", (self.steps,)),
+                ("landmarks", (len(self.tags), 2)),
+                ("true_path", (self.steps, 3)),
+            ):
+                got = np.shape(value := getattr(self, field))
+                if got != shape and (value is not None or field == "time"):
+                    raise InvalidField(field, f"expected shape {shape}, got {got}")
+            if np.max(self.log.scan.tag, initial=-1) >= self.capacity + len(self.robots):
+                raise InvalidField("log", f"a tag is not below the capacity {self.capacity}")
 
     @property
     def steps(self) -> int:

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxslam.core._units import TURN, are_headings_in_degrees
+from jaxslam.core.validation import InvalidField, instance_of, refusals_of, require
 from jaxslam.datasets._lines import TextFile
 from jaxslam.graphs._checks import check_numbers, is_indefinite
 from jaxslam.graphs._factor import REGISTRY
@@ -375,17 +376,18 @@ def write_graph(path: str | Path, graph: Graph) -> None:
             numbers that are not finite, and informations that are not symmetric and positive
             semidefinite.
     """
-    if not isinstance(graph, Graph):
-        raise ValueError(f"write_graph: expected a path and a Graph, got a {type(graph).__name__}")
+    with refusals_of("write_graph"):
+        require("graph", graph, instance_of(Graph))
     path = Path(path)
     packed = path.suffix == ".gz"
     ending = path.with_suffix("").suffix if packed else path.suffix
     text = text_of(graph, _ENDINGS.get(ending, _G2O))
     ids = np.concatenate([np.asarray(graph.pose_id), np.asarray(graph.point_id)])
-    if (ids < 0).any():
-        raise ValueError(f"write_graph: expected ids >= 0, got {ids.min()}")
     factors = {key: REGISTRY[key.split("/")[0]] for key in graph.tables}
-    check_numbers("write_graph", graph, factors)
+    with refusals_of("write_graph"):
+        if (ids < 0).any():
+            raise InvalidField("graph", f"expected ids >= 0, got {ids.min()}")
+        check_numbers(graph, factors)
 
     # Without the time, so that equal graphs give equal files.
     content = gzip.compress(text.encode("utf-8"), mtime=0) if packed else text
@@ -393,8 +395,9 @@ def write_graph(path: str | Path, graph: Graph) -> None:
 
 
 def text_of(graph: Graph, form: Format = _G2O) -> str:
-    """The text of a graph in a format; raises ValueError as `write_graph` does."""
-    _check_writable(graph, form)
+    """The text of a graph in a format; raises InvalidField as `write_graph` does."""
+    with refusals_of("write_graph"):
+        _check_writable(graph, form)
     ids = {"pose": np.asarray(graph.pose_id), "point": np.asarray(graph.point_id)}
     values = {"pose": np.asarray(graph.poses), "point": np.asarray(graph.points)}
     held = {"pose": np.asarray(graph.fixed_pose), "point": np.asarray(graph.fixed_point)}
@@ -419,31 +422,28 @@ def text_of(graph: Graph, form: Format = _G2O) -> str:
 
 
 def _check_writable(graph: Graph, form: Format) -> None:
-    """Raise ValueError on a graph that the format cannot represent."""
+    """Raise InvalidField on a graph that the format cannot represent."""
     if len(both := np.intersect1d(graph.pose_id, graph.point_id)):
-        raise ValueError(
-            f"write_graph: {both[0]} is the id of a pose and of a point, which {form.name} does "
-            "not allow"
+        raise InvalidField(
+            "graph",
+            f"{both[0]} is the id of a pose and of a point, which {form.name} does not allow",
         )
     if len(graph.points) and "point" not in form.vertices:
-        raise ValueError(
-            f"write_graph: {form.name} has no line for points, and the graph has "
-            f"{len(graph.points)}"
-        )
+        count = len(graph.points)
+        raise InvalidField("graph", f"{form.name} has no line for points, and it has {count}")
     if len(graph.points) and graph.points.shape[1] != 2:
-        raise ValueError(
-            f"write_graph: expected points (x, y), got {graph.points.shape[1]} numbers"
-        )
+        size = graph.points.shape[1]
+        raise InvalidField("graph", f"expected points (x, y), got {size} numbers")
     held = np.asarray(graph.pose_id)[np.asarray(graph.fixed_pose)]
     if len(held) and not form.fix:
-        raise ValueError(
-            f"write_graph: {form.name} has no line for fixed poses, and pose {held[0]} is fixed"
-        )
+        reason = f"{form.name} has no line for fixed poses, and pose {held[0]} is fixed"
+        raise InvalidField("graph", reason)
     for key in graph.tables:
         if key.split("/")[0] not in form.edges:
-            raise ValueError(
-                f"write_graph: {form.name} has no line for table {key!r}; it has some for "
-                f"{', '.join(form.edges)}"
+            raise InvalidField(
+                "graph",
+                f"{form.name} has no line for table {key!r}; it has some for "
+                f"{', '.join(form.edges)}",
             )
 
 

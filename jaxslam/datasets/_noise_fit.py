@@ -15,6 +15,7 @@ from jaxslam.calibration import Calibration, NoiseFit, as_associated, fit_noise
 from jaxslam.charts import RightInvariant
 from jaxslam.core.logs._tables import split_unit
 from jaxslam.core.types import Info, Scan, Status
+from jaxslam.core.validation import InvalidField, refusals_of
 from jaxslam.datasets._dataset import Dataset, Parameter
 from jaxslam.filters._ekf.ekf_slam import EkfSlam
 from jaxslam.math.stats import normal_quantile
@@ -93,10 +94,11 @@ def fit(
             as `fit_noise` does.
     """
     models = data.adjustable
-    if models is None:
-        raise ValueError(f"fit: expected a data set with adjustable noises, got {data.name}")
     groups = tuple(calibrate)
-    free = _free_indices(models.parameters, groups, tuple(fixed))
+    with refusals_of("fit"):
+        if models is None:
+            raise InvalidField("data", f"expected one with adjustable noises, got {data.name}")
+        free = _free_indices(models.parameters, groups, tuple(fixed))
     start, key = models.values, jax.random.key(0)
     names = [parameter.name for parameter in models.parameters]
     is_noise = np.array([parameter.group == "noise" for parameter in models.parameters])
@@ -238,14 +240,15 @@ def _free_indices(
     errors = dict.fromkeys(group for group in groups if group != "noise")
     for group in calibrate:
         if group not in errors:
-            raise ValueError(
-                f"fit: expected calibrate to be some of {', '.join(errors) or 'nothing'}, which "
-                f"this data set can adjust, got {group!r}"
+            raise InvalidField(
+                "calibrate",
+                f"expected some of {', '.join(errors) or 'nothing'}, which this data set can "
+                f"adjust, got {group!r}",
             )
     held = {split_unit(name)[0] for name in fixed}
     allowed = dict.fromkeys([*names, *groups])
     for name in sorted(held - set(allowed)):
-        raise ValueError(f"fit: expected fixed parameters of {', '.join(allowed)}, got {name!r}")
+        raise InvalidField("fixed", f"expected some of {', '.join(allowed)}, got {name!r}")
     free = [
         i
         for i, (name, group) in enumerate(zip(names, groups, strict=True))
@@ -253,5 +256,5 @@ def _free_indices(
         and (group in calibrate or (group == "noise" and parameters[i].value > 0))
     ]
     if not free:
-        raise ValueError("fit: expected a parameter to fit, got all held")
+        raise InvalidField("fixed", "expected a parameter to fit, got all held")
     return np.array(free)

@@ -16,9 +16,9 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from jaxslam.core.validation import InvalidFile
+from jaxslam.core.validation import InvalidField, InvalidFile, one_of, refusals_of, require
 from jaxslam.datasets._lines import DIGITS, TextFile, read_bytes
-from jaxslam.laser.grids._grid import Grid, check_grid
+from jaxslam.laser.grids._grid import Grid, grid_map
 from jaxslam.results._files import Files, write_files
 
 _PGM = re.compile(rb"(P[25])" + 3 * rb"(?:\s|#[^\n]*\n)+([^\s#]+)" + rb"\s")
@@ -167,15 +167,15 @@ def write_map(path: str | Path, grid: Grid, *, mode: str = "trinary") -> list[Pa
     """
     path = Path(path)
     if path.suffix != ".yaml" or path.stem == "":
-        raise ValueError(f"write_map: expected a path NAME.yaml, got {path}")
+        raise InvalidField("path", f"expected NAME.yaml, got {path}", owner="write_map")
     return write_files(path.parent, map_files(path.stem, grid, mode))
 
 
 def map_files(stem: str, grid: Grid, mode: str = "trinary") -> Files:
     """The map file STEM.yaml and its image STEM.pgm, for `write_files`."""
-    check_grid("write_map", grid)
-    if mode not in _MODES:
-        raise ValueError(f'write_map: expected mode "trinary" or "scale", got {mode!r}')
+    with refusals_of("write_map"):
+        require("grid", grid, grid_map)
+        require("mode", mode, one_of(*_MODES))
     log_odds = np.asarray(grid.log_odds, np.float64)[::-1]
     if mode == "trinary":
         occupied, free = 0.65, 0.196  # as `map_saver` of ROS writes them

@@ -8,29 +8,30 @@ from jaxtyping import Array, Int
 
 from jaxslam.core._numbers import held_array, is_concrete
 from jaxslam.core._record import set_field
+from jaxslam.core.validation import InvalidField
 
 
 def hold_map(filter: Any) -> None:
     """Check and hold the fields landmarks (N, L) and tags of a filter, in `__post_init__`.
 
-    Raises ValueError, which begins with its class, on invalid ones.
+    Raises InvalidField on invalid ones.
     """
-    name, landmarks, tags = type(filter).__name__, held_array(filter.landmarks), filter.tags
+    landmarks, tags = held_array(filter.landmarks), filter.tags
     set_field(filter, "landmarks", landmarks)
     size, shape = len(filter.sensor.landmark), np.shape(landmarks)
     if len(shape) != 2 or shape[1] != size or shape[0] == 0:
-        raise ValueError(f"{name}: expected landmarks of shape (at least 1, {size}), got {shape}")
+        raise InvalidField("landmarks", f"expected shape (at least 1, {size}), got {shape}")
     if not np.issubdtype(jnp.result_type(landmarks), np.number) or jnp.iscomplexobj(landmarks):
-        raise ValueError(f"{name}: expected a map of real numbers")
+        raise InvalidField("landmarks", "expected real numbers")
     if is_concrete(landmarks) and not np.isfinite(np.asarray(landmarks)).all():
-        raise ValueError(f"{name}: the map is not finite")
+        raise InvalidField("landmarks", "expected finite numbers")
     if tags is None:
         return
     most, values = np.iinfo(np.int32).max, np.asarray(tags)
     good = values.shape == shape[:1] and np.issubdtype(values.dtype, np.integer)
     if not good or len(np.unique(values)) != shape[0] or values.min() < 0 or values.max() > most:
-        raise ValueError(
-            f"{name}: expected {shape[0]} different tags from 0 to {most}, got {tags!r}"
+        raise InvalidField(
+            "tags", f"expected {shape[0]} different ones from 0 to {most}, got {tags!r}"
         )
     set_field(filter, "tags", tuple(values.tolist()))
 

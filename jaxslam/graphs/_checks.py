@@ -3,13 +3,12 @@
 from collections.abc import Mapping
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 import scipy  # its parts load where they are used
 from jaxtyping import Bool, Float, Int
 
 from jaxslam.core._numbers import is_concrete
-from jaxslam.core.types import JaxOrNumPy
+from jaxslam.core.validation import Check, InvalidField, array_of, refusals_of, require
 from jaxslam.graphs._factor import Factor
 from jaxslam.graphs._graph import Graph, Table
 from jaxslam.graphs._solver.model import factors_of
@@ -32,8 +31,8 @@ class Parts(NamedTuple):
     """whether a part has a variable that is not fixed, and so needs a gauge"""
 
 
-def check_graph(name: str, graph: Graph, factors: Mapping[str, Factor]) -> None:
-    """Raise ValueError, which begins with a caller's name, unless a graph can be solved.
+def check_graph(graph: Graph, factors: Mapping[str, Factor]) -> None:
+    """Raise InvalidField unless a graph can be solved.
 
     Refused are tables without a factor or of other sizes than their factor's, arrays of another
     kind than `Graph` and `Table` say, numbers that are not finite, an id twice, a measurement of a
@@ -42,30 +41,35 @@ def check_graph(name: str, graph: Graph, factors: Mapping[str, Factor]) -> None:
     measurement of one pose holds in place: a disconnected graph, or no gauge. A measurement of zero
     information joins nothing. Within a trace only shapes are checked.
     """
-    _check_shapes(name, graph)
+    require("poses", graph.poses, array_of("N", 3))
+    require("points", graph.points, array_of("P", "L"))
+    poses, points = len(graph.poses), len(graph.points)
+    require("pose_id", graph.pose_id, _entries(np.integer, poses))
+    require("point_id", graph.point_id, _entries(np.integer, points))
+    require("fixed_pose", graph.fixed_pose, _entries(np.bool_, poses))
+    require("fixed_point", graph.fixed_point, _entries(np.bool_, points))
     for key, table in graph.tables.items():
         if key not in factors:
-            raise ValueError(
-                f"{name}: table {key!r} has no factor; there are: {', '.join(factors) or 'none'}"
+            raise InvalidField(
+                "factors", f"table {key!r} has no factor; there are: {', '.join(factors) or 'none'}"
             )
-        prefix, factor = f"{name}: table {key!r}", factors[key]
+        place, factor = f"table {key!r}", factors[key]
         rows = np.shape(table.who)[0]
         k, z, r = (len(part) for part in (factor.variables, factor.measurements, factor.errors))
-        wanted = {"who": (rows, k), "z": (rows, z), "information": (rows, r, r), "valid": (rows,)}
-        for field, shape in wanted.items():
-            if (got := np.shape(getattr(table, field))) != shape:
-                raise ValueError(f"{prefix}: expected {field} of shape {shape}, got {got}")
-        _check_kind(prefix, who=(table.who, np.integer), valid=(table.valid, np.bool_))
+        require(f"{place}: who", table.who, _entries(np.integer, rows, k))
+        require(f"{place}: z", table.z, array_of(rows, z))
+        require(f"{place}: information", table.information, array_of(rows, r, r))
+        require(f"{place}: valid", table.valid, _entries(np.bool_, rows))
     if not is_concrete(graph):
         return
-    check_numbers(name, graph, factors)
+    check_numbers(graph, factors)
     if not any(np.asarray(table.valid).any() for table in graph.tables.values()):
-        raise ValueError(f"{name}: the graph has no measurement")
-    _check_gauge(name, graph, factors)
+        raise InvalidField("", "the graph has no measurement")
+    _check_gauge(graph, factors)
 
 
-def check_numbers(name: str, graph: Graph, factors: Mapping[str, Factor]) -> None:
-    """Raise ValueError on variables and rows of a concrete graph that `check_graph` refuses.
+def check_numbers(graph: Graph, factors: Mapping[str, Factor]) -> None:
+    """Raise InvalidField on variables and rows of a concrete graph that `check_graph` refuses.
 
     The gauge is not checked.
     """
@@ -74,12 +78,12 @@ def check_numbers(name: str, graph: Graph, factors: Mapping[str, Factor]) -> Non
         ids = np.asarray(ids)
         bad = ~np.isfinite(np.asarray(values)).all(axis=1)
         if bad.any():
-            raise ValueError(f"{name}: {kind} {ids[bad.argmax()]} is not finite")
+            raise InvalidField("", f"{kind} {ids[bad.argmax()]} is not finite")
         unique, count = np.unique(ids, return_counts=True)
         if (count > 1).any():
-            raise ValueError(f"{name}: {kind} {unique[count.argmax()]} occurs twice")
-    for key, table in graph.tables.items():
-        _check_rows(name, graph, key, table, factors[key])
+            raise InvalidField("", f"{kind} {unique[count.argmax()]} occurs twice")
+    for key in graph.tables:
+        _check_rows(graph, key, factors[key])
 
 
 def _parts_of(graph: Graph, factors: Mapping[str, Factor]) -> Parts:
@@ -127,45 +131,14 @@ def label(graph: Graph, variable: int) -> str:
     return f"point {int(graph.point_id[variable - poses])}"
 
 
-def _check_kind(prefix: str, **values: tuple[JaxOrNumPy, type]) -> None:
-    """Raise ValueError, which begins with a prefix, on arrays of another kind of number.
-
-    An array without entries may be of any kind.
-    """
-    for field, (value, kind) in values.items():
-        if not hasattr(value, "dtype"):
-            raise ValueError(
-                f"{prefix}: expected {field} to be an array, got {type(value).__name__}"
-            )
-        if np.size(value) and not jnp.issubdtype(value.dtype, kind):
-            expected = "bool" if kind is np.bool_ else "integers"
-            raise ValueError(f"{prefix}: expected {field} of {expected}, got {value.dtype}")
+def _entries(kind: type, *shape: int) -> Check:
+    """The check of an array of a shape and kind; one without entries may be of any kind."""
+    return lambda value: array_of(*shape, kind=kind if np.size(value) else np.generic)(value)
 
 
-def _check_shapes(name: str, graph: Graph) -> None:
-    """Raise ValueError on poses and points of other shapes and kinds than `Graph` says."""
-    poses, points = np.shape(graph.poses), np.shape(graph.points)
-    if len(poses) != 2 or poses[1] != 3 or len(points) != 2:
-        raise ValueError(f"{name}: expected poses (N, 3) and points (P, L), got {poses}, {points}")
-    for field, count in (
-        ("pose_id", poses[0]),
-        ("fixed_pose", poses[0]),
-        ("point_id", points[0]),
-        ("fixed_point", points[0]),
-    ):
-        if (got := np.shape(getattr(graph, field))) != (count,):
-            raise ValueError(f"{name}: expected {field} of shape ({count},), got {got}")
-    _check_kind(
-        name,
-        fixed_pose=(graph.fixed_pose, np.bool_),
-        fixed_point=(graph.fixed_point, np.bool_),
-        pose_id=(graph.pose_id, np.integer),
-        point_id=(graph.point_id, np.integer),
-    )
-
-
-def _check_rows(name: str, graph: Graph, key: str, table: Table, factor: Factor) -> None:
-    """Raise ValueError on the first bad row of a table."""
+def _check_rows(graph: Graph, key: str, factor: Factor) -> None:
+    """Raise InvalidField on the first bad row of a table."""
+    table = graph.tables[key]
     valid, who = np.asarray(table.valid), np.asarray(table.who)
     z, information = np.asarray(table.z), np.asarray(table.information)
     for k, kind in enumerate(factor.variables):
@@ -173,9 +146,9 @@ def _check_rows(name: str, graph: Graph, key: str, table: Table, factor: Factor)
         lost = valid & ((who[:, k] < 0) | (who[:, k] >= count))
         if lost.any():
             row = int(lost.argmax())
-            raise ValueError(
-                f"{name}: {key}, row {row}: {kind} index {who[row, k]} is out of "
-                f"range: the graph has {count} {kind}s"
+            raise InvalidField(
+                f"{key}, row {row}",
+                f"{kind} index {who[row, k]} is out of range: the graph has {count} {kind}s",
             )
     variables = np.sort(variables_in(graph, table, factor), axis=1)
     twice = np.zeros(len(valid), bool)
@@ -194,11 +167,11 @@ def _check_rows(name: str, graph: Graph, key: str, table: Table, factor: Factor)
             alone = table._replace(valid=np.arange(len(valid)) == row)
             involved = variables_in(graph, alone, factor)[0]
             between = ", ".join(label(graph, int(variable)) for variable in involved)
-            raise ValueError(f"{name}: {key}, row {row} ({between}): {why}")
+            raise InvalidField(f"{key}, row {row} ({between})", why)
 
 
-def _check_gauge(name: str, graph: Graph, factors: Mapping[str, Factor]) -> None:
-    """Raise ValueError on a part of a graph that nothing holds in place."""
+def _check_gauge(graph: Graph, factors: Mapping[str, Factor]) -> None:
+    """Raise InvalidField on a part of a graph that nothing holds in place."""
     parts = _parts_of(graph, factors)
     loose = np.flatnonzero(~parts.anchored & parts.free)
     if not len(loose):
@@ -207,14 +180,16 @@ def _check_gauge(name: str, graph: Graph, factors: Mapping[str, Factor]) -> None
     labels = ", ".join(label(graph, int(variable)) for variable in members[:3])
     labels += f", … ({len(members):,} variables)" if len(members) > 3 else ""
     if parts.free.sum() == 1 and not parts.anchored.any():
-        raise ValueError(
-            f"{name}: the graph has no gauge: fix a pose (`graphs.with_gauge` fixes the first) or "
-            "give one a prior"
+        raise InvalidField(
+            "",
+            "the graph has no gauge: fix a pose (`graphs.with_gauge` fixes the first) or "
+            "give one a prior",
         )
     count = int((parts.free | parts.anchored).sum())
-    raise ValueError(
-        f"{name}: the graph is disconnected: no measurement with information joins {labels} to a "
-        f"fixed pose or one with a prior; {count} parts, {len(loose)} of them loose"
+    raise InvalidField(
+        "",
+        f"the graph is disconnected: no measurement with information joins {labels} to a "
+        f"fixed pose or one with a prior; {count} parts, {len(loose)} of them loose",
     )
 
 
@@ -224,7 +199,9 @@ def with_gauge(graph: Graph, factors: Mapping[str, Factor] | None = None) -> Gra
     It is the pose of the lowest id, in the largest part where the graph is disconnected. A graph
     that has a gauge is returned as it is: the same object.
     """
-    parts = _parts_of(graph, factors_of("graphs.with_gauge", graph, factors))
+    with refusals_of("graphs.with_gauge"):
+        factors = factors_of(graph, factors)
+    parts = _parts_of(graph, factors)
     if not len(graph.poses) or parts.anchored.any():
         return graph
     fixed = np.asarray(graph.fixed_pose).copy()

@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from jaxslam.core._numbers import is_concrete
+from jaxslam.core.validation import InvalidField, instance_of, refusals_of, require
 from jaxslam.graphs._checks import check_graph, label
 from jaxslam.graphs._factor import Factor
 from jaxslam.graphs._graph import Graph
@@ -72,14 +73,12 @@ def marginals(
             without marginals or those pairs, and outside of a trace on a variable that the
             measurements do not determine.
     """
-    caller = "graphs.marginals"
-    if not isinstance(solution, Solution):
-        raise ValueError(
-            f"{caller}: expected a Solution, whose weights say what a kernel left out, got a "
-            f"{type(solution).__name__}; of a graph as it is: graphs.optimize(graph, iterations=0)"
-        )
-    model = model_of(caller, solution.graph, factors)
-    check_graph(caller, solution.graph, model.factors)
+    hint = "; of a graph as it is: graphs.optimize(graph, iterations=0)"
+    with refusals_of("graphs.marginals"):
+        require("solution", solution, instance_of(Solution, hint))
+        model = model_of(solution.graph, factors)
+        check_graph(solution.graph, model.factors)
+        wanted = checked_pairs(pairs, len(solution.graph.poses) + len(solution.graph.points))
     array = np.asarray if is_concrete(solution) else jnp.asarray  # no program for each shape
     tables = {
         name: table._replace(
@@ -88,31 +87,30 @@ def marginals(
         for name, table in solution.graph.tables.items()
     }
     graph = solution.graph._replace(tables=tables)
-    wanted = checked_pairs(caller, pairs, len(graph.poses) + len(graph.points))
     covariances: Marginals
     if plan is None and is_concrete(graph):
         padded = padded_graph(graph, room)
         rows = np.zeros((padded_size(max(len(wanted), 4 * room), LEAST), 2), int)
         rows[: len(wanted)] = padded_number(wanted, graph, padded)
-        plan = plan_for(caller, padded, model.factors, None, marginals=True, pairs=rows, room=room)
+        plan = plan_for(padded, model.factors, None, marginals=True, pairs=rows, room=room)
         covariances = _marginals(model, padded, plan)
         poses, points, blocks = cut(covariances[:3], (graph.poses, graph.points, wanted))
         singular = original_number(covariances.singular, graph, padded)
         covariances = Marginals(poses, points, blocks, singular)
     else:
-        plan = plan_for(caller, graph, model.factors, plan, marginals=True, pairs=wanted)
-        covariances = _marginals(model, graph, plan)
+        with refusals_of("graphs.marginals"):
+            plan = plan_for(graph, model.factors, plan, marginals=True, pairs=wanted)
+            covariances = _marginals(model, graph, plan)
     singular = covariances.singular
     if is_concrete(singular) and np.ndim(singular) == 0 and singular >= 0:
-        raise ValueError(
-            f"{caller}: the measurements do not determine {label(graph, int(singular))}"
-        )
+        reason = f"the measurements do not determine {label(graph, int(singular))}"
+        raise InvalidField("", reason, owner="graphs.marginals")
     return covariances
 
 
 @partial(jax.jit, inline=True)
 def _marginals(model: Model, graph: Graph, plan: Plan) -> Marginals:
-    return over_batch("graphs.marginals", _invert)((model, plan), graph_in_one_dtype(graph))
+    return over_batch(_invert)((model, plan), graph_in_one_dtype(graph))
 
 
 def _invert(model: Model, plan: Plan, graph: Graph) -> Marginals:

@@ -10,8 +10,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxslam.core._record import record, static
+from jaxslam.core._record import check_field, field, record, static
 from jaxslam.core.protocols import Component, Motion, Sensor
+from jaxslam.core.validation import InvalidField, instance_of
 from jaxslam.math import _linalg as linalg
 from jaxslam.math import se2
 from jaxslam.math.angles import sin_cos, wrap
@@ -105,9 +106,7 @@ class Factor(Component):
         self._check(Factor, {"residual": ""})
         self._check_names("variables", "measurements", "errors")
         if lost := [kind for kind in self.variables if kind not in ("pose", "point")]:
-            raise ValueError(
-                f"{type(self).__name__}: expected variables 'pose' and 'point', got {lost[0]!r}"
-            )
+            raise InvalidField("variables", f"expected 'pose' and 'point', got {lost[0]!r}")
 
     def residual(self, variables: tuple[Array, ...], z: Array) -> Array:
         """The error e (R,) of one row, angles wrapped: each pose (3,), each point (L,)."""
@@ -228,13 +227,9 @@ class FromSensor(Factor):
     R(z) prefers measurements that came out small. A row whose R(ẑ) is singular has no weight.
     """
 
-    sensor: Sensor
+    sensor: Sensor = field(check=instance_of(Sensor))
     own_noise: bool = static(default=False, kw_only=True)
     """the information of the table is for R(ẑ)^{-1/2} e, the identity, and not for e"""
-
-    def __post_init__(self) -> None:
-        _check_model("FromSensor", "sensor", self.sensor, Sensor)
-        super().__post_init__()
 
     @property
     def name(self) -> str:  # type: ignore[override]
@@ -281,7 +276,7 @@ class _MotionFactor(Factor):
     motion: Motion
 
     def __post_init__(self) -> None:
-        _check_model(type(self).__name__, "motion", self.motion, Motion)
+        check_field(self, "motion", instance_of(Motion))
         super().__post_init__()
 
     @property
@@ -318,9 +313,10 @@ class FromMotion(_MotionFactor):
     def __post_init__(self) -> None:
         super().__post_init__()
         if len(self.motion.noises) != 3:
-            raise ValueError(
-                "FromMotion: expected a motion whose noise has 3 components, which two poses "
-                f"determine, got {self.name} with {len(self.errors)}: {', '.join(self.errors)}"
+            raise InvalidField(
+                "motion",
+                "expected one whose noise has 3 components, which two poses "
+                f"determine, got {self.name} with {len(self.errors)}: {', '.join(self.errors)}",
             )
 
     @property
@@ -366,15 +362,6 @@ class NominalMotion(_MotionFactor):
     def residual(self, variables: tuple[Array, ...], z: Array) -> Array:
         first, second = variables
         return se2.between(self.predict(first, z), second)
-
-
-def _check_model(name: str, field: str, value: object, kind: type) -> None:
-    """Raise ValueError unless a field of a factor is a model, e.g. on a class of models."""
-    if not isinstance(value, kind):
-        got = type(value).__name__
-        if isinstance(value, type):
-            got = f"the class {value.__name__}: call it"
-        raise ValueError(f"{name}: expected {field} to be a {kind.__name__}, got {got}")
 
 
 REGISTRY: dict[str, Factor] = {

@@ -9,11 +9,20 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
-from jaxslam.core import _validation as validation
 from jaxslam.core._noise import Constant
 from jaxslam.core._numbers import is_concrete
+from jaxslam.core._validation import check_models, log_of
 from jaxslam.core.protocols import Motion, Sensor
 from jaxslam.core.types import JaxOrNumPy, Log
+from jaxslam.core.validation import (
+    InvalidField,
+    at_least,
+    covariance,
+    finite,
+    or_none,
+    refusals_of,
+    require,
+)
 from jaxslam.graphs._factor import Factor, FromMotion, FromSensor, NominalMotion, Prior
 from jaxslam.graphs._graph import Graph, Table
 from jaxslam.linearize._first_order import motion_jacobians
@@ -76,19 +85,23 @@ def of_log(
             or a measurement has a singular noise, or a noise does not move the pose in all
             directions (a robot at rest, with `Odometry`).
     """
-    name = "graphs.of_log"
-    validation.check_models(name, motion, sensor)
-    if isinstance(sensor, Suite) or sensor.reduced is not None:
-        raise ValueError(
-            f"{name}: expected one sensor of landmarks that stay what they are, got {sensor.name}"
-        )
-    if slack is not None and not 0 <= slack < np.inf:
-        raise ValueError(f"{name}: expected slack to be a finite number >= 0, got {slack}")
-    if not slack and len(motion.noises) < 3:
-        raise ValueError(
-            f"{name}: {motion.name} has {len(motion.noises)} noises, which do not move the pose in "
-            "all directions: give slack, the standard deviation of a soft constraint, as slack=1e-3"
-        )
+    with refusals_of("graphs.of_log"):
+        check_models(motion, sensor)
+        if isinstance(sensor, Suite) or sensor.reduced is not None:
+            reason = f"expected one of landmarks that stay what they are, got {sensor.name}"
+            raise InvalidField("sensor", reason)
+        require("slack", slack, or_none(finite(least=0.0)))
+        if not slack and len(motion.noises) < 3:
+            raise InvalidField(
+                "slack",
+                f"{motion.name} has {len(motion.noises)} noises, which do not move the pose in all "
+                "directions: give the standard deviation of a soft constraint, as slack=1e-3",
+            )
+        sizes = len(motion.controls), len(sensor.measurements)
+        require("log", log, log_of(*sizes))
+        require("pose", pose, finite(3))
+        require("pose_cov", pose_cov, covariance(3))
+        index, valid, ids = _points_of(log, sensor, tags, capacity)
     exact = len(motion.noises) == 3 and slack is None
     motion_factor = FromMotion(motion) if exact else NominalMotion(motion)
     # R may depend on z unless the noise of the innermost sensor is a constant.
@@ -97,19 +110,12 @@ def of_log(
         innermost = innermost.sensor
     sensor_factor = FromSensor(sensor, own_noise=not isinstance(innermost.noise_cov, Constant))
     factors: dict[str, Factor] = {"motion": motion_factor, "sensor": sensor_factor}
-    validation.check_covariance(f"{name}: pose_cov", pose_cov, 3)
-    size_u, size_z = len(motion.controls), len(sensor.measurements)
-    validation.check_log(name, log, control_size=size_u, measurement_size=size_z)
-    if np.shape(pose) != (3,):
-        raise ValueError(f"{name}: expected a pose of shape (3,), got {np.shape(pose)}")
-    if is_concrete(pose) and not np.isfinite(np.asarray(pose)).all():
-        raise ValueError(f"{name}: the pose is not finite")
     fixed = is_concrete(pose_cov) and not np.any(np.asarray(pose_cov))
-    index, valid, ids = _points_of(name, log, sensor, tags, capacity)
     arguments = jnp.asarray(pose), jnp.asarray(pose_cov), index, valid, ids
     soft = None if exact else np.asarray(slack or 0.0)
     graph, regular = _graph_of(motion, sensor_factor, fixed, log, *arguments, soft)
-    _check_noise(name, regular, motion, sensor, valid, fixed)
+    with refusals_of("graphs.of_log"):
+        _check_noise(regular, motion, sensor, valid, fixed)
     if not fixed:
         factors["prior"] = Prior()
     return graph, factors
@@ -126,7 +132,7 @@ class _Regular(NamedTuple):
 
 
 def _points_of(
-    name: str, log: Log, sensor: Sensor, tags: ArrayLike | None, capacity: int | None
+    log: Log, sensor: Sensor, tags: ArrayLike | None, capacity: int | None
 ) -> tuple[JaxOrNumPy, JaxOrNumPy, Int[np.ndarray, "P"]]:
     """The point of each measurement, whether it is used, and the tags of the points."""
     tag = log.scan.tag if tags is None else tags
@@ -135,33 +141,35 @@ def _points_of(
     if not sensor.landmark:
         return log.scan.tag * 0, valid, np.zeros(0, np.int32)
     if np.shape(array) != np.shape(valid):
-        raise ValueError(f"{name}: expected tags of shape {np.shape(valid)}, got {np.shape(array)}")
+        raise InvalidField("tags", f"expected shape {np.shape(valid)}, got {np.shape(array)}")
     if not jnp.issubdtype(array.dtype, np.integer):
-        raise ValueError(f"{name}: expected tags to be integers, got {array.dtype}")
+        raise InvalidField("tags", f"expected integers, got {array.dtype}")
     if is_concrete(array) and is_concrete(valid):
         unknown = np.asarray(valid) & (np.asarray(array) < 0)
         if tags is None and unknown.any():
             row, place = np.argwhere(unknown)[0]
-            raise ValueError(
-                f"{name}: the measurement of row {row}, slot {place} has no identity: give tags= "
-                "of an association"
+            raise InvalidField(
+                "log",
+                f"the measurement of row {row}, slot {place} has no identity: give tags= "
+                "of an association",
             )
         high = np.asarray(valid) & (np.asarray(array) >= (2**31 if capacity is None else capacity))
         if high.any():
-            raise ValueError(
-                f"{name}: expected tags below {capacity}, the capacity, got "
-                f"{np.asarray(array)[high][0]}"
+            raise InvalidField(
+                "tags",
+                f"expected a number below {capacity}, the capacity, got "
+                f"{np.asarray(array)[high][0]}",
             )
     elif capacity is None:
-        raise ValueError(f"{name}: expected capacity, the number of points, of a traced log")
+        raise InvalidField("capacity", "expected the number of points of a traced log, got None")
     if capacity is not None:
-        validation.check_count(f"{name}: capacity", capacity)
+        require("capacity", capacity, at_least(1))
         used = valid & (array >= 0)
         return array * used, used, np.arange(capacity, dtype=np.int32)
     tagged = np.asarray(valid) & (np.asarray(array) >= 0)
     ids = np.unique(np.asarray(array)[tagged]).astype(np.int32)
     if not len(ids):
-        raise ValueError(f"{name}: the log has no measurement of a landmark")
+        raise InvalidField("log", "it has no measurement of a landmark")
     return np.where(tagged, np.searchsorted(ids, array), 0).astype(np.int32), tagged, ids
 
 
@@ -287,16 +295,17 @@ def _place_points(
 
 
 def _check_noise(
-    name: str, regular: _Regular, motion: Motion, sensor: Sensor, valid: JaxOrNumPy, fixed: bool
+    regular: _Regular, motion: Motion, sensor: Sensor, valid: JaxOrNumPy, fixed: bool
 ) -> None:
-    """Raise ValueError where a covariance has no inverse, if the values are concrete."""
+    """Raise InvalidField where a covariance has no inverse, if the values are concrete."""
     if not is_concrete((regular, valid)):
         return
     prior, of_motion, of_sensor, moving = (np.asarray(part) for part in regular)
     if not fixed and not prior:
-        raise ValueError(
-            f"{name}: pose_cov is singular; expected zero, which fixes the first pose, or a "
-            "positive definite covariance"
+        raise InvalidField(
+            "pose_cov",
+            "expected zero, which fixes the first pose, or a positive definite covariance, got a "
+            "singular one",
         )
     for good, reason in (
         (of_motion, f"the noise covariance of {motion.name} is singular"),
@@ -311,4 +320,4 @@ def _check_noise(
     ):
         if not good.all():
             row = int(good.argmin())
-            raise ValueError(f"{name}: {reason} at row {row}, so that it has no information")
+            raise InvalidField("", f"{reason} at row {row}, so that it has no information")

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxslam.core._numbers import is_concrete
 from jaxslam.core._record import record
-from jaxslam.core.validation import InvalidField
+from jaxslam.core.validation import InvalidField, refusals_of
 from jaxslam.graphs._checks import check_graph
 from jaxslam.graphs._factor import PRIOR, Chordal, Factor
 from jaxslam.graphs._graph import Graph
@@ -216,39 +216,37 @@ def certificate(
         ValueError: on other factors, on more poses held than one, and on what `check_graph`
             refuses.
     """
-    caller = "graphs.certificate"
-    model = model_of(caller, graph, factors)
-    for name, factor in model.factors.items():
-        if factor.chordal is None:
-            raise InvalidField(
-                caller,
-                "",
-                f"the table {name!r} has no chordal cost: its factor is {factor.name}, "
-                "and relative poses, relative positions and priors have one",
-            )
-    check_graph(caller, graph, model.factors)
-    plan = plan_for(caller, graph, model.factors, plan)
-    if is_concrete(graph):
-        # NumPy, since each operation on a new shape would be a program.
-        held = np.array(graph.fixed_pose)
+    with refusals_of("graphs.certificate"):
+        model = model_of(graph, factors)
         for name, factor in model.factors.items():
-            if factor.chordal is PRIOR:
-                table = graph.tables[name]
-                held[np.asarray(table.who)[np.asarray(table.valid), 0]] = True
-        if held.sum() != 1:
-            raise InvalidField(
-                caller,
-                "",
-                f"expected one pose that is fixed or has a prior, got {held.sum()}; the "
-                "dual is of a graph that is free but for that",
-            )
-    proof: Certificate = _certificate(model, graph, plan)
-    return proof
+            if factor.chordal is None:
+                raise InvalidField(
+                    "factors",
+                    f"the table {name!r} has no chordal cost: its factor is {factor.name}, "
+                    "and relative poses, relative positions and priors have one",
+                )
+        check_graph(graph, model.factors)
+        plan = plan_for(graph, model.factors, plan)
+        if is_concrete(graph):
+            # NumPy, since each operation on a new shape would be a program.
+            held = np.array(graph.fixed_pose)
+            for name, factor in model.factors.items():
+                if factor.chordal is PRIOR:
+                    table = graph.tables[name]
+                    held[np.asarray(table.who)[np.asarray(table.valid), 0]] = True
+            if held.sum() != 1:
+                raise InvalidField(
+                    "graph",
+                    f"expected one pose that is fixed or has a prior, got {held.sum()}; the "
+                    "dual is of a graph that is free but for that",
+                )
+        proof: Certificate = _certificate(model, graph, plan)
+        return proof
 
 
 @partial(jax.jit, inline=True)
 def _certificate(model: Model, graph: Graph, plan: Plan) -> Certificate:
-    return over_batch("graphs.certificate", _prove)((model, plan), graph_in_one_dtype(graph))
+    return over_batch(_prove)((model, plan), graph_in_one_dtype(graph))
 
 
 def _prove(model: Model, plan: Plan, graph: Graph) -> Certificate:

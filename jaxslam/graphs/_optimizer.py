@@ -8,10 +8,10 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from jaxslam.core._numbers import check_count, is_concrete
+from jaxslam.core._numbers import is_concrete
+from jaxslam.core.validation import at_least, finite, refusals_of, require
 from jaxslam.graphs._checks import check_graph
 from jaxslam.graphs._factor import Factor
 from jaxslam.graphs._graph import Graph
@@ -49,14 +49,16 @@ def squared_residuals(
     Of a row with R residuals, at the truth and with the right Ω, it is χ² distributed with R
     degrees of freedom. factors, room: see `optimize`.
     """
-    factors = factors_of("graphs.squared_residuals", graph, factors)
+    with refusals_of("graphs.squared_residuals"):
+        factors = factors_of(graph, factors)
     squares = _squares_of(factors, padded_graph(graph, room) if is_concrete(graph) else graph)
     return {key: cut(square, graph.tables[key].valid) for key, square in squares.items()}
 
 
 def degrees_of_freedom(graph: Graph, factors: Mapping[str, Factor] | None = None) -> int:
     """The residuals of all valid rows minus the free numbers of poses and points."""
-    factors = factors_of("graphs.degrees_of_freedom", graph, factors)
+    with refusals_of("graphs.degrees_of_freedom"):
+        factors = factors_of(graph, factors)
     residuals = sum(
         int(table.valid.sum()) * len(factors[key].errors) for key, table in graph.tables.items()
     )
@@ -153,7 +155,7 @@ def _factor_and_solve(plan: Plan, system: tuple[Array, Array]) -> Array:
     return substitute(plan.cholesky, factorize(plan.cholesky, blocks), rhs)
 
 
-_solve_by_factor = over_batch("graphs.optimize", _factor_and_solve)
+_solve_by_factor = over_batch(_factor_and_solve)
 
 
 def optimize(
@@ -187,20 +189,17 @@ def optimize(
     Raises:
         ValueError: on what `check_graph` refuses, and on unknown tables.
     """
-    caller = "graphs.optimize"
-    check_count(f"{caller}: iterations", iterations, least=0)
-    if is_concrete(tolerance) and not 0 <= tolerance < np.inf:
-        raise ValueError(
-            f"{caller}: expected tolerance to be a finite number >= 0, got {tolerance}"
-        )
-    model = model_of(caller, graph, factors, kernel)
-    check_graph(caller, graph, model.factors)
-    if plan is not None or not is_concrete(graph):
-        plan = plan_for(caller, graph, model.factors, plan, room=room)
-        exact: Solution = _optimize(model, graph, plan, iterations, tolerance)
-        return exact
-    padded = padded_graph(graph, room)
-    plan = plan_for(caller, padded, model.factors, None, room=room)
+    with refusals_of("graphs.optimize"):
+        require("iterations", iterations, at_least(0))
+        require("tolerance", tolerance, finite(least=0.0))
+        model = model_of(graph, factors, kernel)
+        check_graph(graph, model.factors)
+        if plan is not None or not is_concrete(graph):
+            plan = plan_for(graph, model.factors, plan, room=room)
+            exact: Solution = _optimize(model, graph, plan, iterations, tolerance)
+            return exact
+        padded = padded_graph(graph, room)
+        plan = plan_for(padded, model.factors, None, room=room)
     solution: Solution = _optimize(model, padded, plan, iterations, tolerance)
     rows = {name: table.valid for name, table in graph.tables.items()}
     return solution._replace(
@@ -217,7 +216,9 @@ def chi2(
     kernel: Kernel | Mapping[str, Kernel] | None = None,
 ) -> Float[Array, ""]:
     """The cost χ² = Σ ρ(eᵀ Ω e) of a graph as it is, without a factor ½."""
-    cost: Array = _chi2(model_of("graphs.chi2", graph, factors, kernel), graph)
+    with refusals_of("graphs.chi2"):
+        model = model_of(graph, factors, kernel)
+    cost: Array = _chi2(model, graph)
     return cost
 
 
@@ -248,7 +249,7 @@ def _search(
     return search(model, plan, iterations, tolerance, graph)
 
 
-_search_batch = over_batch("graphs.optimize", _search)
+_search_batch = over_batch(_search)
 
 
 @jax.custom_jvp

@@ -9,6 +9,15 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxslam.core.types import Beams
+from jaxslam.core.validation import (
+    InvalidField,
+    at_least,
+    finite,
+    instance_of,
+    positive,
+    refusals_of,
+    require,
+)
 from jaxslam.math.stats import chi2_quantile
 
 __all__ = ["Segments", "fit_line", "segments"]
@@ -48,21 +57,20 @@ def fit_line(
     Raises ValueError for a sigma not above 0 or a sigma_angle below 0, beams that are not finite,
     fewer than 2, all the same, or in line with the laser.
     """
-    if not (0 < sigma < np.inf and 0 <= sigma_angle < np.inf):
-        raise ValueError(
-            "fit_line: expected sigma above 0 and sigma_angle of at least 0, got "
-            f"{sigma} and {sigma_angle}"
-        )
-    if np.ndim(angle) != 1 or np.shape(angle) != np.shape(distance):
-        raise ValueError(
-            f"fit_line: expected as many angles as ranges, got shapes {np.shape(angle)} and "
-            f"{np.shape(distance)}"
-        )
-    points = _ends_of(angle, distance)
-    if not np.isfinite(points).all():
-        raise ValueError("fit_line: expected finite angles and ranges")
-    if len(points) < 2 or not np.ptp(points, axis=0).max() > 0:
-        raise ValueError(f"fit_line: expected beams that end at different points, got {len(angle)}")
+    with refusals_of("fit_line"):
+        require("sigma", sigma, positive)
+        require("sigma_angle", sigma_angle, finite(least=0.0))
+        if np.ndim(angle) != 1 or np.shape(angle) != np.shape(distance):
+            raise InvalidField(
+                "",
+                f"expected as many angles as ranges, got shapes {np.shape(angle)} and "
+                f"{np.shape(distance)}",
+            )
+        points = _ends_of(angle, distance)
+        if not np.isfinite(points).all():
+            raise InvalidField("", "expected finite angles and ranges")
+        if len(points) < 2 or not np.ptp(points, axis=0).max() > 0:
+            raise InvalidField("", f"expected beams that end at different points, got {len(angle)}")
     e = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     middle = points.mean(axis=0)
     # Start at total least squares: the normal is the direction of least spread, into the wall.
@@ -76,7 +84,9 @@ def fit_line(
         toward = np.maximum(toward, _LEAST_TOWARD)
         met = line[0] / toward
         if np.ptp(met * across) <= 1e-9 * max(sigma, np.abs(distance).max()):
-            raise ValueError("fit_line: expected beams whose ends are not in line with the laser")
+            raise InvalidField(
+                "", "expected beams whose ends are not in line with the laser", owner="fit_line"
+            )
         weight = 1 / ((toward * sigma) ** 2 + (met * across * sigma_angle) ** 2)
         off = toward * distance - line[0]
         # ∂(d n·e - r)/∂(r, α) at the range d at which the beam meets the line.
@@ -185,27 +195,29 @@ def segments(
         ValueError: on beams of unlike lengths, numbers out of range, angles that do not increase,
             and beams that `fit_line` refuses: their ends coincide, or lie in line with the laser.
     """
-    if not isinstance(beams, Beams):
-        raise ValueError(f"segments: expected Beams, got {type(beams).__name__}")
-    angle, distance = (np.asarray(part, np.float64) for part in (beams.angle, beams.range))
-    valid = np.asarray(beams.valid, bool)
-    if angle.ndim != 1 or not angle.shape == distance.shape == valid.shape:
-        raise ValueError(
-            f"segments: expected one scan, (B,) each, got {angle.shape}, {distance.shape} and "
-            f"{valid.shape}"
-        )
-    if not (sigma > 0 and max_range > 0 and sigma_angle >= 0 and least >= 3 and trim >= 0):
-        raise ValueError(
-            "segments: expected sigma and max_range above 0, sigma_angle and trim of at least 0, "
-            f"least of at least 3, got {sigma}, {max_range}, {sigma_angle}, {trim}, {least}"
-        )
-    finite = np.isfinite(angle)
-    angle, distance, valid = angle[finite], distance[finite], valid[finite]
+    with refusals_of("segments"):
+        require("beams", beams, instance_of(Beams))
+        angle, distance = (np.asarray(part, np.float64) for part in (beams.angle, beams.range))
+        valid = np.asarray(beams.valid, bool)
+        if angle.ndim != 1 or not angle.shape == distance.shape == valid.shape:
+            raise InvalidField(
+                "",
+                f"expected one scan, (B,) each, got {angle.shape}, {distance.shape} and "
+                f"{valid.shape}",
+            )
+        require("sigma", sigma, positive)
+        if not max_range > 0:
+            raise InvalidField("max_range", f"expected a number above 0, got {max_range}")
+        require("sigma_angle", sigma_angle, finite(least=0.0))
+        require("trim", trim, finite(least=0.0))
+        require("least", least, at_least(3))
+    usable = np.isfinite(angle)
+    angle, distance, valid = angle[usable], distance[usable], valid[usable]
     step = np.diff(angle)
     beyond = np.sum(step) - 2 * np.pi
     half = 0.5 * np.median(step) if len(step) else 0.0
     if not (step > 0).all() or not beyond <= half:
-        raise ValueError("segments: expected angles that increase within one turn")
+        raise InvalidField("", "expected angles that increase within one turn", owner="segments")
     used, _ = Beams(distance, angle, valid).returns(max_range)
     if beyond > -half and used[0]:  # the last beam has the direction of the first
         used[-1] = False

@@ -121,7 +121,7 @@ def odometry_controls(path: ArrayLike) -> Float[np.ndarray, "T 3"]:
     poses = np.asarray(path, np.float64)
     if poses.ndim != 2 or poses.shape[1] != 3 or not np.isfinite(poses).all():
         reason = f"expected finite poses (T, 3), got {poses.shape}"
-        raise InvalidField("odometry_controls", "path", reason)
+        raise InvalidField("path", reason, owner="odometry_controls")
     moved = np.diff(poses, axis=0)
     c, s = np.cos(poses[:-1, 2]), np.sin(poses[:-1, 2])
     ahead, left = c * moved[:, 0] + s * moved[:, 1], c * moved[:, 1] - s * moved[:, 0]

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxslam.core.validation import positive, require
+from jaxslam.core.validation import positive, refusals_of, require
 from jaxslam.math._arrays import Number
 from jaxslam.math.stats import normal_quantile
 
@@ -27,7 +27,8 @@ def kld_bound(bins: Int[Array, "*K"], error: Number, confidence: float) -> Float
 
     Raises ValueError on a concrete error not above 0.
     """
-    require("kld_bound", "error", error, positive)
+    with refusals_of("kld_bound"):
+        require("error", error, positive)
     z = normal_quantile(confidence)
     many = bins > 1
     dof = jnp.where(many, bins - 1, 1).astype(jnp.result_type(float))

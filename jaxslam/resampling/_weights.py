@@ -26,7 +26,7 @@ def normalized(
     """
     if jnp.ndim(log_weights) != 1 or jnp.shape(log_weights)[0] == 0:
         reason = f"expected shape (P,), P at least 1, got {jnp.shape(log_weights)}"
-        raise InvalidField("normalized", "log_weights", reason)
+        raise InvalidField("log_weights", reason, owner="normalized")
     finite = jnp.isfinite(log_weights)
     some = finite.any()
     highest = jnp.where(some, jnp.max(jnp.where(finite, log_weights, -jnp.inf)), 0.0)

@@ -18,9 +18,10 @@ from jaxslam.consistency.campaign._harness import summaries_of
 from jaxslam.consistency.campaign._kept import add_kept
 from jaxslam.consistency.campaign._pieces import missing_pieces
 from jaxslam.core._numbers import is_number
+from jaxslam.core.validation import InvalidField, refusals_of, require
 from jaxslam.results import _report as report
 from jaxslam.results import store
-from jaxslam.results._files import Files, check_formats, check_writable, versions, write_files
+from jaxslam.results._files import Files, check_writable, versions, write_files
 from jaxslam.verify._user_errors import describe_error
 
 if TYPE_CHECKING:  # Matplotlib is slow to load
@@ -53,9 +54,17 @@ def file_names(formats: Iterable[str], figures: Iterable[str] = FIGURES) -> list
     return [PAGE, RESULT, CURVES, TABLE, *(f"{name}.{kind}" for name in figures for kind in kinds)]
 
 
-def check_figure_formats(caller: str, formats: str | Iterable[str]) -> tuple[str, ...]:
-    """The formats of figures, each once; ValueError on an unknown one."""
-    return check_formats(caller, formats, FORMATS)
+def formats_of_figures(formats: str | Iterable[str]) -> tuple[str, ...]:
+    """The check of formats of figures, which returns each once."""
+    expected = f"expected formats of {', '.join(FORMATS)}"
+    try:
+        kinds = tuple(dict.fromkeys([formats] if isinstance(formats, str) else formats))
+    except TypeError:
+        raise ValueError(f"{expected}, or () for none, got {formats!r}") from None
+    for kind in kinds:
+        if kind not in FORMATS:
+            raise ValueError(f"{expected}, got {kind!r}")
+    return kinds
 
 
 def save_campaign(
@@ -76,9 +85,10 @@ def save_campaign(
         seed: the seed of the campaign; None if unknown.
         tell: called with a line on a figure that could not be drawn.
     """
-    formats = check_figure_formats("Campaign.save", figures)
-    if not isinstance(folder, str | os.PathLike) or not str(folder).strip():
-        raise ValueError(f"Campaign.save: expected a folder, got {folder!r}")
+    with refusals_of("Campaign.save"):
+        formats = require("figures", figures, formats_of_figures)
+        if not isinstance(folder, str | os.PathLike) or not str(folder).strip():
+            raise InvalidField("folder", f"expected a path, got {folder!r}")
     folder = Path(folder)
     check_writable(folder)
     drawings = _drawings(campaign, seed)
@@ -143,8 +153,8 @@ def load(folder: str | Path) -> Campaign:
     """
     folder = Path(folder)
     if not (folder / BLOCKS).is_dir():
-        raise ValueError(
-            f"jaxslam.load: there is no campaign in {folder}: expected {BLOCKS}/ there"
+        raise InvalidField(
+            "", f"there is no campaign in {folder}: expected {BLOCKS}/ there", owner="jaxslam.load"
         )
     kept, path = store.resume(folder / BLOCKS), folder / RESULT
     try:

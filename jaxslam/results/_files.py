@@ -8,7 +8,7 @@ import math
 import os
 import platform
 import tempfile
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import SupportsFloat, TypeAlias
@@ -57,21 +57,6 @@ def versions() -> dict[str, str]:
     return {"python": platform.python_version()} | {
         name: version(name) for name in ("jax", "numpy")
     }
-
-
-def check_formats(
-    caller: str, formats: str | Iterable[str], allowed: Sequence[str]
-) -> tuple[str, ...]:
-    """The formats, each once; ValueError on one that is not allowed."""
-    expected = f"{caller}: expected formats of {', '.join(allowed)}"
-    try:
-        kinds = tuple(dict.fromkeys([formats] if isinstance(formats, str) else formats))
-    except TypeError:
-        raise ValueError(f"{expected}, or () for none, got {formats!r}") from None
-    for kind in kinds:
-        if kind not in allowed:
-            raise ValueError(f"{expected}, got {kind!r}")
-    return kinds
 
 
 def check_writable(folder: Path) -> None:

@@ -35,7 +35,7 @@ class Corrected(Wrapped):
         if not can_correct(self.sensor) or (self.axis is not None and "bearing [rad]" not in names):
             entries = "a range" if self.axis is None else "a range and a bearing"
             reason = f"expected a sensor of {entries}, got one of {', '.join(names)}"
-            raise InvalidField(type(self).__name__, "sensor", reason)
+            raise InvalidField("sensor", reason)
         super().__post_init__()
 
     @property

@@ -95,7 +95,7 @@ class Part:
     def __post_init__(self) -> None:
         if not self.sensor.landmark and self.places != 1:
             reason = f"expected 1 of the absolute sensor {self.sensor.name}, got {self.places}"
-            raise InvalidField(type(self).__name__, "places", reason)
+            raise InvalidField("places", reason)
 
     @property
     def absolute(self) -> bool:
@@ -197,7 +197,7 @@ class Suite(Sensor):
 
     def observe(self, pose: Pose, landmark: Landmark) -> Measurement:
         reason = "a suite has no model of its own: call those of its parts"
-        raise InvalidField(type(self).__name__, "", reason)
+        raise InvalidField("", reason, owner=type(self).__name__)
 
     # The other functions of a model are refused by `observe`, whatever it is given.
     def residual(self, z: Measurement, z_hat: Measurement) -> Measurement:
@@ -217,10 +217,10 @@ def split_scan(scan: Scan, places: Sequence[int]) -> list[Scan]:
     """
     if sum(places) != scan.tag.shape[0]:
         raise InvalidField(
-            "Suite",
             "places",
             f"expected {sum(places)} measurement slots in a scan, {tuple(places)} by sensor, got "
             f"{scan.tag.shape[0]}",
+            owner="Suite",
         )
     ends = list(itertools.accumulate(places))
     return [

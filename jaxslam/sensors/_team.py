@@ -1,6 +1,7 @@
 """The robots of a team: their tags, the layout of controls and scans, and models for one robot."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Array
@@ -10,7 +11,7 @@ from jaxslam.core._numbers import is_whole
 from jaxslam.core._record import field, record, static
 from jaxslam.core._reprs import describe
 from jaxslam.core.protocols import Motion
-from jaxslam.core.validation import covariance, finite, instance_of, or_none
+from jaxslam.core.validation import InvalidField, covariance, finite, instance_of, or_none
 from jaxslam.math._arrays import Control, Pose, ProcessNoise
 from jaxslam.sensors._suite import Part, Suite
 
@@ -34,26 +35,26 @@ class Robot:
     if unknown, and of robot 0"""
 
 
-def check_team(
-    name: str, robots: Sequence[Robot], tags: Sequence[int] | None, landmarks: int
-) -> tuple[int, ...]:
+def team_of_robots(value: Any) -> tuple[Robot, ...]:
+    """The check of a field: a sequence of robots, the first without a start."""
+    if not isinstance(value, Sequence) or len(value) == 0:
+        raise ValueError(f"expected at least one robot, got {describe(value)}")
+    robots = tuple(instance_of(Robot)(robot) for robot in value)
+    if robots[0].start is not None:
+        raise ValueError("expected no start of robot 0: it begins at the pose of the run")
+    return robots
+
+
+def tags_of_robots(robots: int, tags: Sequence[int] | None, landmarks: int) -> tuple[int, ...]:
     """The tags of the robots, by default landmarks, landmarks + 1, …, after the tags of landmarks.
 
-    Raises ValueError, which begins with the caller's name, unless this is a team.
+    Raises InvalidField unless they are so many different integers >= 0.
     """
-    if not isinstance(robots, Sequence) or len(robots) == 0:
-        raise ValueError(f"{name}: expected at least one robot, got {robots!r}")
-    for robot in robots:
-        if not isinstance(robot, Robot):
-            raise ValueError(f"{name}: expected a team.Robot, got {type(robot).__name__}")
-    if robots[0].start is not None:
-        raise ValueError(f"{name}: expected no start of robot 0: it begins at the pose of the run")
-    count = len(robots)
-    tags = tuple(range(landmarks, landmarks + count)) if tags is None else tuple(tags)
-    if len(tags) != count or len(set(tags)) != count:
-        raise ValueError(f"{name}: expected {count} different tags of robots, got {tags}")
+    tags = tuple(range(landmarks, landmarks + robots)) if tags is None else tuple(tags)
+    if len(tags) != robots or len(set(tags)) != robots:
+        raise InvalidField("tags", f"expected {robots} different ones, of the robots, got {tags}")
     if any(not is_whole(tag) or tag < 0 for tag in tags):
-        raise ValueError(f"{name}: expected tags of robots that are integers >= 0, got {tags}")
+        raise InvalidField("tags", f"expected integers >= 0, of the robots, got {tags}")
     return tags
 
 

@@ -12,12 +12,12 @@ from jaxtyping import Array
 from numpy.typing import ArrayLike
 
 from jaxslam._public import publish
-from jaxslam.core._numbers import check_array
 from jaxslam.core._record import FrozenDict, record, static
 from jaxslam.core._units import are_headings_in_degrees
-from jaxslam.core._validation import check_log, check_record
+from jaxslam.core._validation import log_of
 from jaxslam.core.protocols import Motion, Sensor
 from jaxslam.core.types import Log, Truth
+from jaxslam.core.validation import InvalidField, array_of, instance_of, refusals_of, require
 from jaxslam.sensors._suite import Suite
 from jaxslam.simulation._worlds import World
 
@@ -105,83 +105,78 @@ def recorded_world(
     Warns:
         UserWarning: on true headings that fit their path in degrees.
     """
-    check_record("recorded_world", "motion", motion, Motion)
-    check_record("recorded_world", "sensor", sensor, Sensor)
-    if isinstance(logs, Log) or not isinstance(logs, Sequence) or not logs:
-        empty = "an empty " * (isinstance(logs, Sequence) and not logs)
-        raise ValueError(
-            "recorded_world: expected logs as a list of Log, one a run, got "
-            f"{empty}{type(logs).__name__}"
+    with refusals_of("recorded_world"):
+        require("motion", motion, instance_of(Motion))
+        require("sensor", sensor, instance_of(Sensor))
+        if isinstance(logs, Log) or not isinstance(logs, Sequence) or not logs:
+            empty = "an empty " * (isinstance(logs, Sequence) and not logs)
+            got = f"{empty}{type(logs).__name__}"
+            raise InvalidField("logs", f"expected a list of Log, one a run, got {got}")
+        slots = sensor.places if isinstance(sensor, Suite) else ()
+        for i, log in enumerate(logs):
+            sizes = len(motion.controls), len(sensor.measurements)
+            require(f"logs[{i}]", log, log_of(*sizes, slots))
+            if np.shape(log.scan.tag) != np.shape(logs[0].scan.tag):
+                raise InvalidField(
+                    "logs",
+                    "expected the same numbers of rows and measurement slots, got "
+                    f"{np.shape(logs[0].scan.tag)} in run 0 and {np.shape(log.scan.tag)} in "
+                    f"run {i}",
+                )
+        table = np.asarray(landmarks, np.float64)
+        if table.ndim == 2:
+            table = np.broadcast_to(table, (len(logs), *table.shape))
+        log = jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *logs)
+        runs, steps, places = log.scan.tag.shape
+        if starts is None:
+            starts = np.broadcast_to(np.asarray(pose, np.float64), (runs, 3))
+        truth = Truth(
+            np.asarray(poses, np.float64),
+            table,
+            np.zeros((runs, steps), np.int32),
+            np.asarray(starts, np.float64),
+            None if origin is None else np.asarray(origin),
         )
-    table = np.asarray(landmarks, np.float64)
-    if table.ndim == 2:
-        table = np.broadcast_to(table, (len(logs), *table.shape))
-    for i, log in enumerate(logs):
-        check_record("recorded_world", f"logs[{i}]", log, Log)
-        check_log(
-            f"recorded_world: run {i}",
-            log,
-            control_size=len(motion.controls),
-            measurement_size=len(sensor.measurements),
-            parts=sensor.places if isinstance(sensor, Suite) else (),
-        )
-        if np.shape(log.scan.tag) != np.shape(logs[0].scan.tag):
-            raise ValueError(
-                "recorded_world: expected logs of the same numbers of rows and measurement slots, "
-                f"got {np.shape(logs[0].scan.tag)} in run 0 and {np.shape(log.scan.tag)} in run {i}"
+        require("poses", truth.pose, array_of(runs, steps, 3))
+        require("landmarks", table, array_of(runs, "N", len(sensor.landmark)))
+        require("starts", truth.start, array_of(runs, 3))
+        if truth.origin is not None:
+            require("origin", truth.origin, array_of(runs, steps, places, kind=np.integer))
+        numbers = {"poses": truth.pose, "landmarks": table, "starts": truth.start}
+        for argument, values in numbers.items():
+            finite = np.isfinite(values)
+            if not finite.all():
+                run, *place = np.argwhere(~finite)[0]
+                row, hint = "", ""
+                if argument == "poses":
+                    row, hint = f", row {place[0]}", ": cut the log to rows with a true pose"
+                raise InvalidField(argument, f"expected finite numbers of run {run}{row}{hint}")
+        tags = np.where(log.scan.valid, log.scan.tag, -1)
+        if tags.max(initial=-1) >= table.shape[1]:
+            run, row, _ = np.argwhere(tags >= table.shape[1])[0]
+            raise InvalidField(
+                "logs",
+                f"expected tags below {table.shape[1]}, the number of landmarks, got {tags.max()} "
+                f"(run {run}, row {row})",
             )
-    log = jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *logs)
-    runs, steps, places = log.scan.tag.shape
-    first = np.broadcast_to(np.asarray(pose, np.float64), (runs, 3)) if starts is None else starts
-    truth = Truth(
-        np.asarray(poses, np.float64),
-        table,
-        np.zeros((runs, steps), np.int32),
-        np.asarray(first, np.float64),
-        None if origin is None else np.asarray(origin),
-    )
-    check_array("recorded_world: poses", truth.pose, (runs, steps, 3))
-    check_array("recorded_world: landmarks", table, (runs, "N", len(sensor.landmark)))
-    check_array("recorded_world: starts", truth.start, (runs, 3))
-    if truth.origin is not None:
-        check_array("recorded_world: origin", truth.origin, (runs, steps, places), np.integer)
-    for name_of_field in ("pose", "landmarks", "start"):
-        finite = np.isfinite(getattr(truth, name_of_field))
-        if not finite.all():
-            run, *place = np.argwhere(~finite)[0]
-            row, hint = "", ""
-            if name_of_field == "pose":
-                row = f", row {place[0]}"
-                hint = ": cut the log to rows with a true pose"
-            raise ValueError(
-                f"recorded_world: true {name_of_field} of run {run}{row}: expected finite numbers"
-                f"{hint}"
+        if wrong := [i for i, path in enumerate(truth.pose) if are_headings_in_degrees(path)]:
+            warnings.warn(
+                f"recorded_world: the true headings of run {wrong[0]} contradict the directions "
+                "between its positions, which fit them as degrees: expected [rad]",
+                stacklevel=2,
             )
-    if wrong := [i for i, path in enumerate(truth.pose) if are_headings_in_degrees(path)]:
-        warnings.warn(
-            f"recorded_world: the true headings of run {wrong[0]} contradict the directions "
-            "between its positions, which fit them as degrees: expected [rad]",
-            stacklevel=2,
+        return RecordedWorld(
+            name=name,
+            motion=motion,
+            sensor=sensor,
+            truth=truth,
+            log=log,
+            pose=pose,
+            pose_cov=pose_cov,
+            filter_options=filter_options or {},
+            published=published or {},
+            source=source,
         )
-    tags = np.where(log.scan.valid, log.scan.tag, -1)
-    if tags.max(initial=-1) >= table.shape[1]:
-        run, row, _ = np.argwhere(tags >= table.shape[1])[0]
-        raise ValueError(
-            f"recorded_world: expected tags below {table.shape[1]}, the number of landmarks, got "
-            f"{tags.max()} (run {run}, row {row})"
-        )
-    return RecordedWorld(
-        name=name,
-        motion=motion,
-        sensor=sensor,
-        truth=truth,
-        log=log,
-        pose=pose,
-        pose_cov=pose_cov,
-        filter_options=filter_options or {},
-        published=published or {},
-        source=source,
-    )
 
 
 publish("jaxslam", RecordedWorld, recorded_world)

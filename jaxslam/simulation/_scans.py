@@ -11,6 +11,7 @@ from jaxslam.core._numbers import is_concrete
 from jaxslam.core._record import record
 from jaxslam.core.protocols import Sensor
 from jaxslam.core.types import Scan
+from jaxslam.core.validation import InvalidField
 from jaxslam.math._arrays import Landmark, Number, Pose
 from jaxslam.math._linalg import root_psd
 from jaxslam.sensors._suite import Part
@@ -38,9 +39,8 @@ class BetweenRanges:
         if is_concrete(self.nearest, self.farthest) and not np.all(
             (np.asarray(self.nearest) >= 0) & (self.nearest < np.asarray(self.farthest))
         ):
-            raise ValueError(
-                f"BetweenRanges: expected 0 <= nearest < farthest, got {self.nearest} and "
-                f"{self.farthest}"
+            raise InvalidField(
+                "", f"expected 0 <= nearest < farthest, got {self.nearest} and {self.farthest}"
             )
 
     def __call__(self, pose: Pose, landmark: Landmark) -> jax.Array:
@@ -68,10 +68,8 @@ def sensor_scans(
     by_time = None if targets.ndim == 2 else 0
     seen = jax.vmap(jax.vmap(visible, (None, 0)), (0, by_time))(poses, targets)
     if seen.shape != (len(poses), count) or seen.dtype != bool:
-        raise ValueError(
-            f"visible: expected a bool for each pose and landmark, got {seen.dtype} of shape "
-            f"{seen.shape[2:]}"
-        )
+        got = f"{seen.dtype} of shape {seen.shape[2:]}"
+        raise InvalidField("visible", f"expected a bool for each pose and landmark, got {got}")
     if on is not None:
         seen = seen & on[:, None]
     if places < count:

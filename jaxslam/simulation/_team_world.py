@@ -1,7 +1,7 @@
 """Worlds of several robots that move among landmarks and see each other."""
 
 from collections.abc import Mapping
-from dataclasses import KW_ONLY, field
+from dataclasses import KW_ONLY
 
 import jax
 import jax.numpy as jnp
@@ -10,11 +10,19 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from jaxslam._public import publish
-from jaxslam.core._record import FrozenDict, hold_function, record, set_field, static
+from jaxslam.core._record import FrozenDict, field, function_of, record, set_field, static
 from jaxslam.core.protocols import Motion, Sensor
 from jaxslam.core.types import Log, Scan, Truth
+from jaxslam.core.validation import InvalidField
 from jaxslam.math import se2
-from jaxslam.sensors._team import Robot, TeamMotion, check_team, sensors_of, sizes
+from jaxslam.sensors._team import (
+    Robot,
+    TeamMotion,
+    sensors_of,
+    sizes,
+    tags_of_robots,
+    team_of_robots,
+)
 from jaxslam.simulation._scans import Visible, everywhere, part_scan, side_by_side
 from jaxslam.simulation._worlds import World, drive, random_pose
 
@@ -35,7 +43,7 @@ class TeamWorld(World):
     report, and as `Scenario` does.
     """
 
-    robots: tuple[Robot, ...]
+    robots: tuple[Robot, ...] = field(check=team_of_robots)
     """R robots, in a list or tuple"""
     landmarks: ArrayLike = field()
     """(N, 2)"""
@@ -51,29 +59,26 @@ class TeamWorld(World):
     """(3,) mean of the prior of robot 0 before the first control, and"""
     pose_cov: ArrayLike = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     """(3, 3) its covariance"""
-    visible: Visible = everywhere
+    visible: Visible = field(default=everywhere, check=function_of("pose", "l"))
     published: Mapping[str, Mapping[str, float]] = static(default=FrozenDict())
     source: str = static(default="")
     """see `Scenario` for these three fields"""
 
     def __post_init__(self) -> None:
         count = int(np.shape(self.landmarks)[0]) if np.ndim(self.landmarks) == 2 else 0
-        tags = check_team("TeamWorld", self.robots, self.tags, count)
-        set_field(self, "robots", tuple(self.robots))
+        tags = tags_of_robots(len(self.robots), self.tags, count)
         set_field(self, "tags", tags)
         clash = [tag for tag in tags if tag < count]
         if clash:
-            raise ValueError(
-                f"TeamWorld: expected tags of robots from {count} on, after the landmarks', got "
-                f"{clash[0]}"
+            raise InvalidField(
+                "", f"expected tags of robots from {count} on, after the landmarks', got {clash[0]}"
             )
         if any(robot.start is None for robot in self.robots[1:]):
-            raise ValueError("TeamWorld: expected a start of every robot but robot 0")
+            raise InvalidField("", "expected a start of every robot but robot 0")
         if type(self.report) is not int or not 0 <= self.report < len(self.robots):
-            raise ValueError(
-                f"TeamWorld: expected report from 0 to {len(self.robots) - 1}, got {self.report!r}"
+            raise InvalidField(
+                "report", f"expected a number from 0 to {len(self.robots) - 1}, got {self.report!r}"
             )
-        hold_function(self, "visible", "pose, l")
         super().__post_init__()
 
     @property

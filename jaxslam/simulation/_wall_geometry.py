@@ -8,6 +8,7 @@ from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from jaxslam.core.types import JaxOrNumPy
+from jaxslam.core.validation import InvalidField, refusals_of
 
 
 class Walls(NamedTuple):
@@ -108,18 +109,21 @@ def wall_lines(
     segment, and on one without free space on exactly one side.
     """
     ends = np.asarray(world.segments, np.float64)
-    if not len(ends):
-        raise ValueError("wall_lines: expected at least one segment")
-    along = ends[:, 1] - ends[:, 0]
-    length = np.hypot(along[:, 0], along[:, 1])
-    if np.any(length == 0):
-        raise ValueError(f"wall_lines: segment {int(np.argmin(length))} has no length")
+    with refusals_of("wall_lines"):
+        if not len(ends):
+            raise InvalidField("world", "expected at least one segment")
+        along = ends[:, 1] - ends[:, 0]
+        length = np.hypot(along[:, 0], along[:, 1])
+        if np.any(length == 0):
+            raise InvalidField("", f"segment {int(np.argmin(length))} has no length")
     normal = np.stack([along[:, 1], -along[:, 0]], axis=1) / length[:, None]
     middle, step = ends.mean(axis=1), 1e-6 * (1 + np.abs(ends).max())
     before, behind = (is_free(world, middle + side * step * normal) for side in (-1, 1))
     if np.any(before == behind):
-        raise ValueError(
-            f"wall_lines: segment {int(np.argmax(before == behind))} has no free side, or two"
+        raise InvalidField(
+            "",
+            f"segment {int(np.argmax(before == behind))} has no free side, or two",
+            owner="wall_lines",
         )
     normal[behind] *= -1
     r = (normal * middle).sum(axis=1)

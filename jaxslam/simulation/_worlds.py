@@ -3,7 +3,6 @@ key."""
 
 import functools
 from collections.abc import Callable, Mapping
-from dataclasses import field
 from functools import partial
 from typing import Any, Literal
 
@@ -15,11 +14,24 @@ from numpy.typing import ArrayLike
 
 from jaxslam._origin import FAR, far_origin, move_near_origin, to_map_coordinates
 from jaxslam._public import publish
-from jaxslam.core._numbers import check_covariance, check_key, held_array, is_concrete
-from jaxslam.core._record import FrozenDict, hold_function, record, set_field, static
-from jaxslam.core._validation import check_record, reworded_tracer_errors
+from jaxslam.core._numbers import held_array, is_concrete
+from jaxslam.core._record import FrozenDict, field, function_of, record, set_field, static
+from jaxslam.core._validation import reworded_tracer_errors
 from jaxslam.core.protocols import Component, Motion, Sensor
 from jaxslam.core.types import Log, Scan, Truth
+from jaxslam.core.validation import (
+    Check,
+    InvalidField,
+    at_least,
+    covariance,
+    finite,
+    instance_of,
+    one_of,
+    or_none,
+    prng_key,
+    refusals_of,
+    require,
+)
 from jaxslam.math._xla import quick_options
 from jaxslam.math.angles import wrap
 from jaxslam.sensors._suite import Suite
@@ -72,22 +84,25 @@ class World(Component):
         return f"{type(self).__name__}({contents})"
 
     def __post_init__(self) -> None:
-        title = f"{type(self).__name__} {self.name!r}"
         self._check(World, {"draw": "key"})
-        check_record(title, "motion", self.motion, Motion)
-        check_record(title, "sensor", self.sensor, Sensor)
-        _check_table(f"{title}: landmarks", self.landmarks, len(self.sensor.landmark))
-        _check_table(f"{title}: controls", self.controls, len(self.motion.controls))
-        if np.shape(self.pose) != (3,):
-            raise ValueError(f"{title}: pose: expected shape (3,), got {np.shape(self.pose)}")
-        _check_table(f"{title}: pose", np.reshape(self.pose, (1, -1)), 3)
-        check_covariance(f"{title}: pose_cov", self.pose_cov, 3)
-        for name in ("landmarks", "controls", "pose", "pose_cov"):
-            if name in self.__dict__:
-                set_field(self, name, held_array(getattr(self, name)))
-        for name in ("filter_options", "published"):
-            if name in self.__dict__:
-                set_field(self, name, FrozenDict.of(f"{title}: {name}", getattr(self, name)))
+        # A subclass may have a property in place of a field.
+        for name, check in {
+            "motion": instance_of(Motion),
+            "sensor": instance_of(Sensor),
+            "pose": finite(3),
+            "pose_cov": covariance(3),
+            "filter_options": FrozenDict.of,
+            "published": FrozenDict.of,
+        }.items():
+            self._check_field(name, check)
+        self._check_field("landmarks", _table_of(len(self.sensor.landmark)))
+        self._check_field("controls", _table_of(len(self.motion.controls)))
+
+    def _check_field(self, name: str, check: Check) -> None:
+        """Check a field, or a property of that name."""
+        value = require(name, getattr(self, name), check)
+        if name in self.__dict__:
+            set_field(self, name, value)
 
     @property
     def steps(self) -> int:
@@ -121,12 +136,14 @@ class Scenario(World):
     """(3,) mean of the filter's prior of the pose before the first control."""
     pose_cov: ArrayLike = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     """(3, 3) covariance of the true start about `pose`, and of that prior."""
-    noise_on: Literal["robot", "odometry"] = static(default="robot")
+    noise_on: Literal["robot", "odometry"] = static(
+        default="robot", check=one_of("robot", "odometry")
+    )
     """"robot": the noise moves the true robot, and the log holds the nominal control. "odometry":
     the true robot follows the nominal control, and the noise is on the control in the log."""
-    visible: Visible = everywhere
+    visible: Visible = field(default=everywhere, check=function_of("pose", "l"))
     """the sensor's field of view."""
-    places: int | None = static(default=None)
+    places: int | None = static(default=None, check=or_none(at_least(1)))
     """M measurement slots of a scan; default N. The lowest tags get a slot first, and the landmarks
     in view beyond M are counted in `Truth.missed`."""
     spurious: Spurious | None = None
@@ -142,20 +159,12 @@ class Scenario(World):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        title = f"Scenario {self.name!r}"
-        hold_function(self, "visible", "pose, l")
-        if self.noise_on not in ("robot", "odometry"):
-            raise ValueError(
-                f'{title}: expected noise_on "robot" or "odometry", got {self.noise_on!r}'
-            )
         if self.noise_on == "odometry" and self.motion.perturb is None:
-            raise ValueError(f"{title}: expected a motion with `perturb` for noise on the odometry")
-        if self.places is not None and self.places < 1:
-            raise ValueError(f"{title}: expected places >= 1, got {self.places}")
+            raise InvalidField("motion", "expected one with `perturb` for noise on the odometry")
         if isinstance(self.sensor, Suite) and (self.places or self.spurious) is not None:
-            raise ValueError(
-                f"{title}: expected neither places nor spurious with a suite: each Part has "
-                "its own places"
+            raise InvalidField(
+                "",
+                "expected neither places nor spurious with a suite: each Part has its own places",
             )
 
     def draw(self, key: Array) -> tuple[Truth, Log]:
@@ -212,9 +221,14 @@ def simulate(scenario: World, key: Array) -> tuple[Truth, Log]:
     relative to its start, if that makes no difference to its models, and the truth is returned in
     float64, on the host: float32 could not hold it.
     """
-    check_record("simulate", "scenario", scenario, World)
-    with jax.transfer_guard("allow"), reworded_tracer_errors(f"{scenario.name}: draw"):
-        check_key("simulate", key)
+    with refusals_of("simulate"):
+        require("scenario", scenario, instance_of(World))
+        require("key", key, prng_key)
+    with (
+        jax.transfer_guard("allow"),
+        refusals_of(f"{scenario.name}: draw"),
+        reworded_tracer_errors(),
+    ):
         near: World | None = None
         origin = None
         # A new array is a tracer where a trace is active, also where all arguments are constants.
@@ -234,12 +248,12 @@ def _draw(scenario: World, key: Array) -> tuple[Truth, Log]:
 
 
 def draw_history(scenario: World, key: Array) -> tuple[Truth, Log]:
-    """The truth and log that a world draws; raises ValueError on anything else."""
+    """The truth and log that a world draws; raises InvalidField on anything else."""
     history = scenario.draw(key)
     kinds = tuple(map(type, history)) if isinstance(history, tuple) else (type(history),)
     if kinds != (Truth, Log):
         got = ", ".join(kind.__name__ for kind in kinds)
-        raise ValueError(f"{scenario.name}: draw: expected (Truth, Log), got {got}")
+        raise InvalidField("draw", f"expected (Truth, Log), got {got}", owner=scenario.name)
     return history
 
 
@@ -250,10 +264,9 @@ def world_of_run(scenario: World, key: Array, number: int) -> tuple[Truth, Log]:
     """
     most = scenario.recorded_runs
     if most is not None and not 0 <= number < most:
-        raise ValueError(
-            f"{scenario.name}: expected a run from 0 to {most - 1}, the recorded ones, got {number}"
-        )
-    with reworded_tracer_errors(f"{scenario.name}: draw"):
+        reason = f"expected a run from 0 to {most - 1}, the recorded ones, got {number}"
+        raise InvalidField("", reason, owner=scenario.name)
+    with refusals_of(f"{scenario.name}: draw"), reworded_tracer_errors():
         history: tuple[Truth, Log] = _draw_run(scenario, key, number)
         return history
 
@@ -276,7 +289,8 @@ def draw_block(scenario: World, key: Array, first: int) -> tuple[Truth, Log]:
     """
     numbers = np.arange(first, first + BLOCK, dtype=jnp.result_type(int))
     program = _draws_program(jax.default_backend())
-    with jax.transfer_guard("allow"), reworded_tracer_errors(f"{scenario.name}: draw"):
+    owner = refusals_of(f"{scenario.name}: draw")
+    with jax.transfer_guard("allow"), owner, reworded_tracer_errors():
         histories: tuple[Truth, Log] = jax.device_get(program(scenario, key, numbers))
         return histories
 
@@ -329,15 +343,20 @@ def drive(
     return history
 
 
-def _check_table(name: str, values: ArrayLike, columns: int) -> None:
-    shape = np.shape(values)
-    if len(shape) == 2 and shape[1] == columns and shape[0] > 0 and not is_concrete(values):
-        return  # a tracer, as when maps are drawn under vmap
-    table = np.asarray(values)
-    if table.ndim != 2 or table.shape[1] != columns or table.shape[0] == 0:
-        raise ValueError(f"{name}: expected shape (N, {columns}) with N >= 1, got {table.shape}")
-    if not np.issubdtype(table.dtype, np.number) or not np.all(np.isfinite(table)):
-        raise ValueError(f"{name}: expected finite numbers")
+def _table_of(columns: int) -> Check:
+    """The check of a table (N, columns) of finite numbers, N at least 1."""
+
+    def check(value: ArrayLike) -> ArrayLike:
+        shape = np.shape(value)
+        if len(shape) != 2 or shape[1] != columns or shape[0] == 0:
+            raise ValueError(f"expected shape (N, {columns}) with N >= 1, got {shape}")
+        if is_concrete(value):  # no tracer, as when maps are drawn under vmap
+            table = np.asarray(value)
+            if not np.issubdtype(table.dtype, np.number) or not np.all(np.isfinite(table)):
+                raise ValueError("expected finite numbers")
+        return held_array(value)
+
+    return check
 
 
 publish("jaxslam", World, Scenario, simulate)

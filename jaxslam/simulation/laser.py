@@ -9,11 +9,22 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike
 
-from jaxslam.core._numbers import check_key, check_mount, check_positive, held_array, is_concrete
-from jaxslam.core._record import record, set_field, static
+from jaxslam.core._numbers import held_array, is_concrete
+from jaxslam.core._record import field, record, set_field, static
 from jaxslam.core._reprs import short_repr
 from jaxslam.core.protocols import Motion
 from jaxslam.core.types import Beams, JaxOrNumPy
+from jaxslam.core.validation import (
+    InvalidField,
+    in_range,
+    instance_of,
+    mounting_pose,
+    or_none,
+    positive,
+    prng_key,
+    refusals_of,
+    require,
+)
 from jaxslam.math import se2
 from jaxslam.math._arrays import Number, Pose
 from jaxslam.simulation._wall_geometry import Walls, exact_ranges, wall_ranges
@@ -31,36 +42,28 @@ __all__ = [
 ]
 
 
+def _angles_of_beams(value: ArrayLike) -> ArrayLike:
+    """The check of the angles (B,) of at least one beam, finite."""
+    shape = np.shape(value)
+    if len(shape) != 1 or 0 in shape or (is_concrete(value) and not np.all(np.isfinite(value))):
+        raise ValueError(f"expected finite angles (at least 1,), got {shape}")
+    return held_array(value)
+
+
 @record
 class Laser:
     """A 2-D laser scanner. Raises ValueError on numbers out of range."""
 
-    angles: Float[JaxOrNumPy, "B"]
+    angles: Float[JaxOrNumPy, "B"] = field(check=_angles_of_beams)
     """directions of the beams in the frame of the mount [rad]"""
-    sigma: Number = 0.02
+    sigma: Number = field(default=0.02, check=positive)
     """standard deviation of a range [m]"""
-    max_range: Number = 10.0
+    max_range: Number = field(default=10.0, check=positive)
     """[m]; a beam that meets nothing nearer has this range, without noise"""
-    dropout: Number = 0.0
+    dropout: Number = field(default=0.0, check=in_range(0.0, 1.0))
     """share of the beams that return nothing, in [0, 1]; they are not valid"""
-    mount: ArrayLike | None = None
+    mount: ArrayLike | None = field(default=None, check=or_none(mounting_pose))
     """(3,) pose on the robot"""
-
-    def __post_init__(self) -> None:
-        set_field(self, "angles", held_array(self.angles))
-        shape = np.shape(self.angles)
-        if (
-            len(shape) != 1
-            or 0 in shape
-            or (is_concrete(self.angles) and not np.all(np.isfinite(self.angles)))
-        ):
-            raise ValueError(f"Laser: expected finite angles (at least 1,), got {shape}")
-        check_positive("Laser", sigma=self.sigma, max_range=self.max_range)
-        if is_concrete(self.dropout) and not 0 <= self.dropout <= 1:
-            raise ValueError(f"Laser: expected dropout in [0, 1], got {self.dropout}")
-        if self.mount is not None:
-            check_mount("Laser", self.mount)
-            set_field(self, "mount", held_array(self.mount))
 
     def frame(self, pose: Pose) -> Pose:
         """The pose of the laser, pose ∘ mount."""
@@ -139,9 +142,9 @@ def scan(laser: Laser, walls: Walls, pose: Float[Array, "3"], key: Array) -> Bea
 
 def scan_world(world: LaserWorld, key: Array) -> LaserHistory:
     """A random history of a world: its path, odometry and scans; traceable, as `simulate` is."""
-    if not isinstance(world, LaserWorld):
-        raise ValueError(f"scan_world: expected a LaserWorld, got {type(world).__name__}")
-    check_key("scan_world", key)
+    with refusals_of("scan_world"):
+        require("world", world, instance_of(LaserWorld))
+        require("key", key, prng_key)
     history: LaserHistory = _scan_world(world, key)
     return history
 
@@ -192,7 +195,8 @@ def scan_information(
     """
     place = np.asarray(pose, np.float64)
     if place.shape != (3,):
-        raise ValueError(f"scan_information: expected a pose (x, y, θ), got {place.shape}")
+        reason = f"expected (x, y, θ), got shape {place.shape}"
+        raise InvalidField("pose", reason, owner="scan_information")
     ranges, slopes = (
         np.asarray(part, np.float64) for part in _ranges_and_slopes(laser, walls, place)
     )
@@ -205,7 +209,8 @@ def scan_information(
     np.put_along_axis(share, order, reached * (1 - passed[order]), axis=1)
     met = (share > 0) & (ranges < laser.max_range * (1 - 1e-6))
     if not met.any():
-        raise ValueError(f"scan_information: no beam from {place} meets a wall within max_range")
+        reason = f"no beam from {place} meets a wall within max_range"
+        raise InvalidField("pose", reason, owner="scan_information")
     g = slopes[met]
     dropout, sigma = (float(np.asarray(number)) for number in (laser.dropout, laser.sigma))
     information = (1 - dropout) / sigma**2 * (share[met] * g.T) @ g

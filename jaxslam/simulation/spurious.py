@@ -6,13 +6,20 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxslam.core._numbers import is_concrete
-from jaxslam.core._record import record, static
+from jaxslam.core._record import field, record, static
 from jaxslam.core.protocols import Sensor
 from jaxslam.core.types import Scan
+from jaxslam.core.validation import InvalidField, finite, in_range
 from jaxslam.math._arrays import Number
 from jaxslam.math._linalg import root_psd
 
 __all__ = ["Spurious"]
+
+
+def _at_least_zero(value: Number) -> Number:
+    """The check of a finite number >= 0."""
+    finite(least=0.0)(value)
+    return value
 
 
 @record
@@ -24,31 +31,23 @@ class Spurious:
     or false measurements without a reach.
     """
 
-    clutter: float = static(default=0.0)
+    clutter: float = static(default=0.0, check=_at_least_zero)
     """false measurements a scan, on average: binomial, over 2·clutter further slots, rounded up"""
-    missed: Number = 0.0
+    missed: Number = field(default=0.0, check=in_range(0.0, 1.0))
     """probability that a landmark in view is not measured"""
-    outliers: Number = 0.0
+    outliers: Number = field(default=0.0, check=in_range(0.0, 1.0))
     """probability that a measurement is false, though its tag is right"""
-    mislabelled: Number = 0.0
+    mislabelled: Number = field(default=0.0, check=in_range(0.0, 1.0))
     """probability that a tag is wrong: the wrong ones of a scan are permuted in a cycle (a single
     one keeps its own)"""
-    reach: Number = 0.0
+    reach: Number = field(default=0.0, check=_at_least_zero)
     """[m]"""
 
     def __post_init__(self) -> None:
-        for name in ("missed", "outliers", "mislabelled"):
-            value = getattr(self, name)
-            if is_concrete(value) and not 0 <= value <= 1:
-                raise ValueError(f"Spurious: expected {name} from 0 to 1, got {value}")
-        if not (self.clutter >= 0 and np.isfinite(self.clutter)):
-            raise ValueError(f"Spurious: expected clutter of at least 0, got {self.clutter}")
         needs_reach = self.clutter > 0 or not is_concrete(self.outliers) or self.outliers > 0
-        if is_concrete(self.reach) and (
-            not np.isfinite(self.reach) or self.reach < 0 or (self.reach == 0 and needs_reach)
-        ):
-            raise ValueError(
-                f"Spurious: expected a reach above 0 with false measurements, got {self.reach}"
+        if is_concrete(self.reach) and self.reach == 0 and needs_reach:
+            raise InvalidField(
+                "reach", f"expected a number above 0 with false measurements, got {self.reach}"
             )
 
     @property

@@ -6,6 +6,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxslam._public import publish
+from jaxslam.core.validation import (
+    InvalidField,
+    at_least,
+    instance_of,
+    positive,
+    refusals_of,
+    require,
+)
 from jaxslam.laser.grids._grid import Grid
 from jaxslam.simulation._wall_geometry import Walls, is_free
 
@@ -28,33 +36,34 @@ def make_walls(
             outside [0, 1].
     """
     segments = [np.zeros((0, 2, 2))]
-    for k, chain in enumerate(chains):
-        corners = np.asarray(chain, np.float64)
-        if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3:
-            raise ValueError(
-                f"make_walls: expected chain {k} of at least three corners (x, y), got "
-                f"{corners.shape}"
-            )
-        segments.append(np.stack([corners, np.roll(corners, -1, axis=0)], axis=1))
-    rounds = (
-        np.atleast_2d(np.asarray(circles, np.float64)) if np.size(circles) else np.zeros((0, 3))
-    )
-    if rounds.ndim != 2 or rounds.shape[1] != 3:
-        raise ValueError(f"make_walls: expected circles (x, y, radius), got shape {rounds.shape}")
-    walls = Walls(np.concatenate(segments), rounds)
-    if not all(np.all(np.isfinite(part)) for part in walls[:2]) or np.any(rounds[:, 2] <= 0):
-        raise ValueError("make_walls: expected finite numbers and radii above 0")
-    if len(walls.segments) + len(rounds) == 0:
-        raise ValueError("make_walls: expected at least one wall")
-    if not glass:
-        return walls
-    shares = [np.zeros(len(chain)) for chain in segments[1:]]
-    for (k, side), share in glass.items():
-        if not (0 <= k < len(shares) and 0 <= side < len(shares[k])):
-            raise ValueError(f"make_walls: glass: chain {k} has no side {side}")
-        if not 0 <= share <= 1:
-            raise ValueError(f"make_walls: glass: expected a share in [0, 1], got {share}")
-        shares[k][side] = share
+    with refusals_of("make_walls"):
+        for k, chain in enumerate(chains):
+            corners = np.asarray(chain, np.float64)
+            if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3:
+                raise InvalidField(
+                    "chains",
+                    f"expected chain {k} of at least three corners (x, y), got {corners.shape}",
+                )
+            segments.append(np.stack([corners, np.roll(corners, -1, axis=0)], axis=1))
+        rounds = (
+            np.atleast_2d(np.asarray(circles, np.float64)) if np.size(circles) else np.zeros((0, 3))
+        )
+        if rounds.ndim != 2 or rounds.shape[1] != 3:
+            raise InvalidField("circles", f"expected (x, y, radius), got shape {rounds.shape}")
+        walls = Walls(np.concatenate(segments), rounds)
+        if not all(np.all(np.isfinite(part)) for part in walls[:2]) or np.any(rounds[:, 2] <= 0):
+            raise InvalidField("", "expected finite numbers and radii above 0")
+        if len(walls.segments) + len(rounds) == 0:
+            raise InvalidField("", "expected at least one wall")
+        if not glass:
+            return walls
+        shares = [np.zeros(len(chain)) for chain in segments[1:]]
+        for (k, side), share in glass.items():
+            if not (0 <= k < len(shares) and 0 <= side < len(shares[k])):
+                raise InvalidField("glass", f"chain {k} has no side {side}")
+            if not 0 <= share <= 1:
+                raise InvalidField("glass", f"expected a share in [0, 1], got {share}")
+            shares[k][side] = share
     return walls._replace(glass=np.concatenate(shares))
 
 
@@ -75,12 +84,10 @@ def rasterize(
     Raises:
         ValueError: a resolution or a number of samples that is not above 0.
     """
-    if not isinstance(world, Walls):
-        raise ValueError(f"rasterize: expected Walls, got a {type(world).__name__}")
-    if not 0 < resolution < np.inf or samples < 1:
-        raise ValueError(
-            f"rasterize: expected a resolution and samples above 0, got {resolution}, {samples}"
-        )
+    with refusals_of("rasterize"):
+        require("world", world, instance_of(Walls))
+        require("resolution", resolution, positive)
+        require("samples", samples, at_least(1))
     corners = [np.asarray(world.segments).reshape(-1, 2)]
     for x, y, radius in np.asarray(world.circles):
         turn = 2 * np.pi * np.arange(360) / 360

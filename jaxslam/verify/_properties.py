@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from jaxslam.core._numbers import check_covariance
 from jaxslam.core.protocols import Motion, Sensor
+from jaxslam.core.validation import InvalidField, covariance, require
 from jaxslam.math._xla import quick_jit
 from jaxslam.verify._differences import modulo_periods
 from jaxslam.verify._findings import Check
@@ -225,8 +225,8 @@ def _covariances(
         return f"noise_cov returns shape {covs.shape[1:]}, expected ({size}, {size})"
     for cov in covs:
         try:
-            check_covariance("noise_cov", cov, size)
-        except ValueError as error:
+            require("noise_cov", cov, covariance(size))
+        except InvalidField as error:
             return str(error)
     return ""
 

@@ -6,7 +6,9 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
+from jaxslam.core._reprs import describe
 from jaxslam.core.protocols import Motion, Sensor
+from jaxslam.core.validation import InvalidField, at_least, positive, refusals_of, require
 from jaxslam.graphs import Factor
 from jaxslam.laser.grids.beam_models import BeamModel
 from jaxslam.math._arrays import float64
@@ -91,38 +93,35 @@ def verify_jacobians(
         ValueError: if the length of an argument is not known, states have the wrong shape,
             or count or a tolerance is not positive.
     """
-    if not tolerance > 0 or not float32_tolerance > 0:
-        raise ValueError(
-            f"verify_jacobians: expected tolerances above 0, got {tolerance} and "
-            f"{float32_tolerance}"
-        )
-    if count < 2:
-        raise ValueError(f"verify_jacobians: expected count >= 2, got {count}")
-    if not 0 <= seed < 2**32:
-        raise ValueError(f"verify_jacobians: expected a seed between 0 and 2³²-1, got {seed}")
-    if not (isinstance(model, Motion | Sensor | Factor | BeamModel) or callable(model)):
-        raise ValueError(
-            "verify_jacobians: expected a Motion, a Sensor, a Factor, a BeamModel or a function of "
-            f"vectors, got {type(model).__name__}"
-        )
-    if (
-        not isinstance(model, Motion | Sensor | Factor | BeamModel)
-        and jacobian is None
-        and makes_a_model(model)
-    ):
-        factory = getattr(model, "__name__", "factory")
-        factory_kind = "class" if isinstance(model, type) else "factory"
-        parameters = inspect.signature(model).parameters.values()
-        noise = "noise_cov" if any(p.default is p.empty for p in parameters) else ""
-        raise ValueError(
-            f"verify_jacobians: expected a Motion, a Sensor or a Factor, got the {factory_kind} "
-            f"{factory} of one: call it, as in {factory}({noise}), or use "
-            f"jaxslam.verify.build({factory})"
-        )
-    if not (jacobian is None or callable(jacobian)):
-        raise ValueError(
-            f"verify_jacobians: expected jacobian to be a function, got {type(jacobian).__name__}"
-        )
+    with refusals_of("verify_jacobians"):
+        require("tolerance", tolerance, positive)
+        require("float32_tolerance", float32_tolerance, positive)
+        require("count", count, at_least(2))
+        if not 0 <= seed < 2**32:
+            raise InvalidField("seed", f"expected a number between 0 and 2³²-1, got {seed}")
+        if not (isinstance(model, Motion | Sensor | Factor | BeamModel) or callable(model)):
+            raise InvalidField(
+                "model",
+                "expected a Motion, a Sensor, a Factor, a BeamModel or a function of "
+                f"vectors, got {type(model).__name__}",
+            )
+        if (
+            not isinstance(model, Motion | Sensor | Factor | BeamModel)
+            and jacobian is None
+            and makes_a_model(model)
+        ):
+            factory = getattr(model, "__name__", "factory")
+            factory_kind = "class" if isinstance(model, type) else "factory"
+            parameters = inspect.signature(model).parameters.values()
+            noise = "noise_cov" if any(p.default is p.empty for p in parameters) else ""
+            raise InvalidField(
+                "model",
+                f"expected a Motion, a Sensor or a Factor, got the {factory_kind} "
+                f"{factory} of one: call it, as in {factory}({noise}), or use "
+                f"jaxslam.verify.build({factory})",
+            )
+        if not (jacobian is None or callable(jacobian)):
+            raise InvalidField("jacobian", f"expected a function, got {describe(jacobian)}")
     if isinstance(model, Motion | Sensor):
         kind, name = "motion" if isinstance(model, Motion) else "sensor", model.name
         model = with_signature_errors(model)
@@ -139,9 +138,9 @@ def verify_jacobians(
         kind, name = "function", functions[0].name
     samples = None
     if states is not None:
-        samples = _samples_of_states(
-            functions[0], states, by_name=kind == "function" and not arguments
-        )
+        with refusals_of("verify_jacobians"):
+            by_name = kind == "function" and not arguments
+            samples = _samples_of_states(functions[0], states, by_name=by_name)
     if samples is None and isinstance(model, BeamModel):
         samples = beam_samples(model, count, seed)
     evaluated, checks, notes, linearity = examine(model, functions, samples, count, seed)
@@ -176,7 +175,9 @@ def build(
             return model
     probe = factory(lambda *_: None)
     if not isinstance(probe, Motion | Sensor):
-        raise ValueError(f"expected a Motion or a Sensor, got {type(probe).__name__}")
+        raise InvalidField(
+            "factory", f"expected one of a Motion or a Sensor, got {describe(probe)}"
+        )
     size = len(probe.noises if isinstance(probe, Motion) else probe.measurements)
     return factory(0.01 * np.eye(size), **mounted)
 
@@ -184,7 +185,7 @@ def build(
 def _samples_of_states(
     function: Function, states: Sequence[ArrayLike], *, by_name: bool
 ) -> Samples:
-    """The states of the caller; raises ValueError on a wrong shape.
+    """The states of the caller; raises InvalidField on a wrong shape.
 
     by_name: whether lengths may follow from the names of the arguments.
     """
@@ -203,9 +204,6 @@ def _samples_of_states(
             if by_name and argument.name in NAMED and table.ndim == 2
             if table.shape[1] != len(argument.entries)
         ]
-        raise ValueError(
-            "; ".join(
-                [f"verify_jacobians: expected states of shapes {expected}, got {shapes}", *fixed]
-            )
-        )
+        reason = "; ".join([f"expected shapes {expected}, got {shapes}", *fixed])
+        raise InvalidField("states", reason)
     return Samples(tuple(tables), ("given",) * len(tables[0]))

@@ -9,8 +9,9 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from jaxslam.core._numbers import check_covariance, is_concrete
+from jaxslam.core._numbers import is_concrete
 from jaxslam.core.protocols import Motion, Sensor
+from jaxslam.core.validation import InvalidField, covariance, positive, refusals_of, require
 from jaxslam.math._linalg import root_psd
 
 __all__ = ["Linearity", "linearity_index", "motion_linearity", "sensor_linearity"]
@@ -73,15 +74,15 @@ def linearity_index(
     Raises:
         ValueError: if cov or noise_cov is not a covariance of the right size, or sigmas <= 0.
     """
-    point = _vector("linearity_index: state", x)
-    if is_concrete(point) and not np.all(np.isfinite(np.asarray(point))):
-        raise ValueError("linearity_index: the state is not finite")
-    check_covariance("linearity_index: cov", cov, point.shape[0])
-    shape = jax.eval_shape(f, point).shape
-    if len(shape) != 1:
-        raise ValueError(f"linearity_index: expected f to return (m,), got shape {shape}")
-    if is_concrete(sigmas) and not 0 < sigmas < np.inf:
-        raise ValueError(f"linearity_index: expected sigmas above 0, got {sigmas}")
+    with refusals_of("linearity_index"):
+        point = _vector("x", x)
+        if is_concrete(point) and not np.all(np.isfinite(np.asarray(point))):
+            raise InvalidField("x", "the state is not finite")
+        require("cov", cov, covariance(point.shape[0]))
+        shape = jax.eval_shape(f, point).shape
+        if len(shape) != 1:
+            raise InvalidField("f", f"expected it to return (m,), got shape {shape}")
+        require("sigmas", sigmas, positive)
     root = root_psd(jnp.asarray(cov, point.dtype))
 
     def g(xi: jax.Array) -> jax.Array:
@@ -93,7 +94,8 @@ def linearity_index(
     rows = slope.shape[0]
     reach2 = jnp.sum(slope**2, axis=1)
     if noise_cov is not None:
-        check_covariance("linearity_index: noise_cov", noise_cov, rows)
+        with refusals_of("linearity_index"):
+            require("noise_cov", noise_cov, covariance(rows))
         reach2 = reach2 + jnp.diagonal(jnp.asarray(noise_cov, point.dtype))
     smooth = jnp.isfinite(hessians).all(axis=(1, 2))
     values, vectors = jnp.linalg.eigh(jnp.where(smooth[:, None, None], hessians, 0.0))  # (m, n, n)
@@ -124,9 +126,10 @@ def motion_linearity(
     motion: Motion, pose: ArrayLike, u: ArrayLike, pose_cov: ArrayLike, *, sigmas: float = 3.0
 ) -> Linearity:
     """`linearity_index` of `step` by pose and noise, covariance blockdiag(pose_cov, Q(pose, u))."""
-    at = _vector("motion_linearity: pose", pose, 3)
-    control = _vector("motion_linearity: u", u, len(motion.controls)).astype(at.dtype)
-    check_covariance("motion_linearity: pose_cov", pose_cov, 3)
+    with refusals_of("motion_linearity"):
+        at = _vector("pose", pose, 3)
+        control = _vector("u", u, len(motion.controls)).astype(at.dtype)
+        require("pose_cov", pose_cov, covariance(3))
     noise = motion.noise_cov(at, control)
     cov = jax.scipy.linalg.block_diag(jnp.asarray(pose_cov, at.dtype), noise)
     x = jnp.concatenate([at, jnp.zeros(noise.shape[0], at.dtype)])
@@ -158,8 +161,9 @@ def sensor_linearity(
 
     with_noise: whether departures are relative to the sensor's noise, too (R in the index).
     """
-    at = _vector("sensor_linearity: pose", pose, 3)
-    point = _vector("sensor_linearity: landmark", landmark, len(sensor.landmark))
+    with refusals_of("sensor_linearity"):
+        at = _vector("pose", pose, 3)
+        point = _vector("landmark", landmark, len(sensor.landmark))
     x = jnp.concatenate([at, point.astype(at.dtype)])
     noise = sensor.noise_cov(sensor.observe(x[:3], x[3:])) if with_noise else None
     return linearity_index(
@@ -172,12 +176,12 @@ def sensor_linearity(
     )
 
 
-def _vector(name: str, value: ArrayLike, size: int | None = None) -> Float[Array, "n"]:
-    """A value as a floating-point vector; raises ValueError on another shape."""
+def _vector(argument: str, value: ArrayLike, size: int | None = None) -> Float[Array, "n"]:
+    """A value as a floating-point vector; raises InvalidField on another shape."""
     vector = jnp.asarray(value)
     if vector.ndim != 1 or size not in (None, vector.shape[0]):
         expected = "(n,)" if size is None else f"({size},)"
-        raise ValueError(f"{name}: expected shape {expected}, got {vector.shape}")
+        raise InvalidField(argument, f"expected shape {expected}, got {vector.shape}")
     return vector.astype(jnp.result_type(vector, float))
 
 

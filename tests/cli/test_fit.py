@@ -96,10 +96,10 @@ def test_the_noises_of_a_folder_are_fitted_and_written(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--fix", "motion w"], "fit: expected fixed parameters of motion v, motion omega"),
+        (["--fix", "motion w"], "fit: fixed: expected some of motion v, motion omega"),
         (
             ["--fix", "motion v,motion omega,sensor range,sensor bearing"],
-            "fit: expected a parameter",
+            "fit: fixed: expected a parameter",
         ),
     ],
 )
@@ -110,9 +110,9 @@ def test_what_cannot_be_fitted_is_refused(tmp_path, refused, options, message):
 
 def test_a_data_set_with_fixed_noises_or_other_errors_is_refused(tmp_path):
     data = datasets.table(write(tmp_path, 5))
-    with pytest.raises(ValueError, match="fit: expected a data set with adjustable noises"):
+    with pytest.raises(ValueError, match="fit: data: expected one with adjustable noises"):
         datasets.fit(dataclasses.replace(data, adjustable=None))
-    with pytest.raises(ValueError, match="fit: expected calibrate to be some of scale, wheels, he"):
+    with pytest.raises(ValueError, match="fit: calibrate: expected some of scale, wheels, he"):
         datasets.fit(data, calibrate=["axis"])
 
 

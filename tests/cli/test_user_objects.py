@@ -149,7 +149,7 @@ def test_a_filter_of_another_size_and_a_world_without_covariance_are_refused(min
     compass = changed(world.sensor, measurements=("heading [rad]",))
     with pytest.raises(
         ValueError,
-        match=r"ready takes measurements \(ahead \[m\], left \[m\]\), .* gives \(heading",
+        match=r"ready: it takes measurements \(ahead \[m\], left \[m\]\), .* gives \(heading",
     ):
         files.filters(f"{mine}:ready", dataclasses.replace(world, sensor=compass))
     mine.write_text(

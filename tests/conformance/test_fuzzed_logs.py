@@ -20,6 +20,7 @@ from jaxslam import catalog, run
 from jaxslam.core import _numbers, _validation
 from jaxslam.core.protocols import Filter
 from jaxslam.core.types import Log, Scan, Status
+from jaxslam.core.validation import require
 from jaxslam.graphs.smoothing import BatchMap, Smoother
 
 WIDE = int(os.environ.get("JAXSLAM_FUZZ", "1"))
@@ -194,7 +195,7 @@ def test_outside_a_trace_a_log_is_well_formed_or_refused_by_row_and_slot(data):
     ]
     log = Log(control, Scan(z, tag, valid))
     if all(sane):
-        _validation.check_log("run", log, control_size=2, measurement_size=2)
+        require("log", log, _validation.log_of(2, 2))
         return
-    with pytest.raises(ValueError, match=r"^run: log\.(control|scan\.(z|tag)).* \(row \d+"):
-        _validation.check_log("run", log, control_size=2, measurement_size=2)
+    with pytest.raises(ValueError, match=r"^log\.(control|scan\.(z|tag)).* \(row \d+"):
+        require("log", log, _validation.log_of(2, 2))

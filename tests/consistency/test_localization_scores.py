@@ -73,7 +73,9 @@ def test_the_summary_averages_runs_and_says_which_are_lost():
     assert found.coverage.value == pytest.approx(np.mean([1, 1 / 3, 2 / 3]))
     assert found.nees.value == pytest.approx(np.mean([1, (9 + 1) / 2, 1]))
     assert found.unimodal == pytest.approx(7 / 9)
-    with pytest.raises(ValueError, match="summarize_localization: expected skip from 0 to 3"):
+    with pytest.raises(
+        ValueError, match="summarize_localization: skip: expected a number from 0 to 3"
+    ):
         consistency.summarize_localization(scores(error), skip=4)
 
 

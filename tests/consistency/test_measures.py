@@ -283,7 +283,7 @@ def test_what_is_called_a_bound_bounds():
 
 
 @refused(
-    ({"spurious": Spurious()}, "one robot"),
+    ({"spurious": Spurious()}, "one of a single robot"),
     ({}, "leading axis"),
     told="posterior_bound: .*",
 )

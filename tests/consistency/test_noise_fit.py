@@ -194,12 +194,12 @@ def nothing(p, x):
 @refused(
     (gated, [0.5], {}, "expected the same measurements at all parameters, got "),
     (nothing, [0.5], {}, "expected fused measurements, got none at parameters"),
-    (scatter, [np.nan, 1], {}, "expected a start of shape"),
+    (scatter, [np.nan, 1], {}, r"start: expected shape \(P,\), finite"),
     (scatter, [0.0, 1], {}, r"expected standard deviations above 0"),
-    (scatter, [1.0, 1], {"guess": [1.0]}, "expected a guess of shape"),
-    (scatter, [1.0, 1], {"names": ["a"]}, "expected 2 names and deviations"),
+    (scatter, [1.0, 1], {"guess": [1.0]}, r"guess: expected shape \(P,\), finite"),
+    (scatter, [1.0, 1], {"names": ["a"]}, "expected 2 of each"),
     (scatter, [1.0, 1], {"iterations": 0}, "iterations: expected an integer >= 1"),
-    (scatter, [1.0, 1], {"tolerance": 0}, "expected a tolerance above 0"),
+    (scatter, [1.0, 1], {"tolerance": 0}, "tolerance: expected a number above 0"),
     (scatter, [1e-200, 1], {}, "the likelihood or its gradient is not finite"),
     told="fit_noise: .*",
 )

@@ -3,6 +3,7 @@
 import copy
 import dataclasses
 import pickle
+from pathlib import Path
 
 import chex
 import jax
@@ -29,6 +30,8 @@ from jaxslam.core.validation import (
     one_of,
     or_none,
     positive,
+    refusals_of,
+    require,
 )
 from jaxslam.motion import OdometryNoise
 
@@ -153,7 +156,7 @@ class Checked:
 
     def __post_init__(self):
         if is_concrete(self.width) and self.count > self.width:  # numbers, by their checks
-            raise InvalidField("Checked", "", "expected count <= width")
+            raise InvalidField("", "expected count <= width")
 
 
 @record
@@ -166,7 +169,7 @@ class Below(Checked):
     def __post_init__(self):
         super().__post_init__()
         if self.extra == 3:
-            raise InvalidField("Below", "extra", "expected no 3")
+            raise InvalidField("extra", "expected no 3")
 
 
 @pytest.mark.parametrize(
@@ -208,6 +211,23 @@ def test_a_check_converts_and_is_not_run_where_jax_rebuilds():
     assert again.mount is made.mount and again.rule is made.rule
     assert jax.tree.map(lambda leaf: -leaf, made).width == -2.0
     assert jax.jit(lambda width: Checked(width, count=1).width)(2.0) == 2.0
+
+
+def test_a_function_owns_what_its_checks_refuse():
+    """Of nested ones the inner; a record within keeps its own, and no frame is added."""
+
+    def length(value):
+        require("length", value, positive)
+
+    for value, owner, name in ((Checked, "Checked", "width"), (length, "inner", "of.length")):
+        with pytest.raises(InvalidField) as caught, refusals_of("outer"), refusals_of("inner"):
+            require("of", -1.0, value)
+        assert (caught.value.owner, caught.value.field) == (owner, name)
+        assert str(pickle.loads(pickle.dumps(caught.value))).startswith(f"{owner}: {name}: ")
+        files = [Path(str(entry.path)) for entry in caught.traceback]
+        assert files[0] == Path(__file__) and "contextlib.py" not in {file.name for file in files}
+    with pytest.raises(ValueError, match=r"^plain$"), refusals_of("outer"):
+        raise ValueError("plain")
 
 
 def test_an_error_of_a_file_says_the_place():
@@ -412,11 +432,17 @@ def test_a_gradient_of_a_world_is_a_world():
 
 
 @refused(
-    ({"landmarks": np.zeros((2, 3))}, r"Scenario 'ring': landmarks: expected shape \(N, 2\)"),
-    ({"pose_cov": -np.eye(3)}, "Scenario 'ring': pose_cov"),
+    (
+        {"landmarks": np.zeros((2, 3))},
+        r"Scenario: landmarks: expected shape \(N, 2\) with N >= 1, got \(2, 3\)",
+    ),
+    (
+        {"pose_cov": -np.eye(3)},
+        r"Scenario: pose_cov: the covariance is not positive semi-definite \(negative",
+    ),
     ({"visible": 3.0}, r"Scenario: visible: expected a function of \(pose, l\), got 3.0"),
     ({"filter_options": {"gate": np.ones(2)}}, "filter_options: gate: expected a value"),
-    ({"noise_on": "wheels"}, "expected noise_on"),
+    ({"noise_on": "wheels"}, 'noise_on: expected "robot" or'),
 )
 def test_a_world_names_what_is_wrong_in_it(change):
     dataclasses.replace(worlds.ring(3), **change)

@@ -95,7 +95,9 @@ def test_a_mount_that_is_given_takes_the_place_of_that_of_the_lines(read):
 
 @pytest.mark.parametrize("mount", [(0, 0), (0, 0, np.nan), "ahead", ((0, 0, 0),)])
 def test_a_mount_that_is_none_is_refused(read, mount):
-    with pytest.raises(ValueError, match=r"^carmen: expected a mount of three finite numbers, got"):
+    with pytest.raises(
+        ValueError, match=r"^carmen: mount: expected finite numbers of shape \(3,\), got"
+    ):
         read(line("FLASER", ROBOT[0]), mount=mount)
 
 

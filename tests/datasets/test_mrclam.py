@@ -78,7 +78,7 @@ def test_mrclam_errors_say_where(tmp_path, name, old, new, line, reason):
 
 @pytest.mark.parametrize("robot", [0, 6, -1, 1.0, "1", True, None])
 def test_mrclam_has_robots_one_to_five(tmp_path, robot):
-    with pytest.raises(ValueError, match="expected a robot from 1 to 5"):
+    with pytest.raises(ValueError, match="robot: expected a number from 1 to 5"):
         datasets.mrclam(write(tmp_path, MRCLAM), robot)
 
 

@@ -58,15 +58,15 @@ def test_what_is_no_calibration_is_refused(tmp_path):
     with pytest.raises(ValueError, match="expected a RobotCalibration, got"):
         datasets.mrclam(tmp_path, 1, calibration={1: KNOWN})
     for wrong, why in (
-        ({"depth": 0.0}, "depth of a calibration to be a finite number above 0"),
-        ({"bearing_noise": -1.0}, "bearing_noise of a calibration to be a finite number >= 0"),
-        ({"axis": np.nan}, "axis of a calibration to be a finite number, got nan"),
-        ({"turn": "fast"}, "turn of a calibration to be a finite number, got 'fast'"),
+        ({"depth": 0.0}, "depth: expected a finite number above 0"),
+        ({"bearing_noise": -1.0}, "bearing_noise: expected a finite number >= 0"),
+        ({"axis": np.nan}, "axis: expected a finite number, got nan"),
+        ({"turn": "fast"}, "turn: expected a finite number, got 'fast'"),
     ):
-        with pytest.raises(ValueError, match=f"mrclam: expected the {why}"):
+        with pytest.raises(ValueError, match=f"mrclam: calibration.{why}"):
             datasets.mrclam(tmp_path, 1, calibration=KNOWN._replace(**wrong))
     write(tmp_path, TEAM)
-    for calibration, why in (({1: KNOWN}, "robot 2 has no calibration"), (3, "got int")):
+    for calibration, why in (({1: KNOWN}, "calibration: robot 2 has none"), (3, "got 3")):
         with pytest.raises(ValueError, match=why):
             datasets.mrclam_team(tmp_path, (1, 2), calibration=calibration)
     shared, each = (

@@ -52,7 +52,7 @@ def test_mrclam_team_by_hand(tmp_path):
 
 @pytest.mark.parametrize("robots", [(), (1, 1), (0, 1), (1, 6), (1.0,), ("1",)])
 def test_mrclam_team_has_different_robots(tmp_path, robots):
-    with pytest.raises(ValueError, match="expected different robots from 1 to 5"):
+    with pytest.raises(ValueError, match="robots: expected different ones from 1 to 5"):
         datasets.mrclam_team(write(tmp_path, TEAM), robots)
 
 

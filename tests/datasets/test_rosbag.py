@@ -559,8 +559,11 @@ def test_a_laser_that_is_tilted_a_little_is_told(tmp_path):
 
 
 @refused(
-    ({"max_range": 0}, "rosbag: expected a max_range above 0, got 0"),
-    ({"mount": (1, 2)}, r"rosbag: expected a mount of three finite numbers, got \(1, 2\)"),
+    ({"max_range": 0}, "rosbag: max_range: expected a number above 0, got 0"),
+    (
+        {"mount": (1, 2)},
+        r"rosbag: mount: expected finite numbers of shape \(3,\), got a tuple of shape",
+    ),
     ({}, "no.bag: cannot be read: no such file"),
 )
 def test_arguments_that_do_not_fit(options):

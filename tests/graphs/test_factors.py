@@ -123,13 +123,13 @@ def test_where_the_noise_does_not_move_the_pose_nothing_is_infinite():
 
 def test_a_variable_is_a_pose_or_a_point():
     names = {"measurements": ("x [m]",), "errors": ("x [m]",)}
-    with pytest.raises(ValueError, match="Own: expected variables 'pose' and 'point', got 'place'"):
+    with pytest.raises(
+        ValueError, match="Own: variables: expected 'pose' and 'point', got 'place'"
+    ):
         made(graphs.Factor, variables=("place",), residual=lambda v, z: z, **names)
     with pytest.raises(ValueError, match="Own: residual: expected a method"):
         made(graphs.Factor, variables=("pose",), **names)
-    with pytest.raises(
-        ValueError, match="FromSensor: expected sensor to be a Sensor, got the class"
-    ):
+    with pytest.raises(ValueError, match="FromSensor: sensor: expected a Sensor, got the class"):
         graphs.FromSensor(sensors.Compass)
 
 
@@ -242,7 +242,7 @@ def test_one_model_for_a_batch():
     plan = graphs.plan(GRAPH)
     widths = jnp.array([1.0, 2.0])
     with pytest.raises(
-        ValueError, match=r"^graphs\.optimize: expected the same factors, kernels, plan and"
+        ValueError, match=r"^graphs\.optimize: graphs: expected the same factors, kernels, plan and"
     ):
         jax.vmap(lambda k: graphs.optimize(GRAPH, plan=plan, kernel=graphs.Huber(k)))(widths)
 
@@ -348,6 +348,6 @@ def test_the_weight_of_a_kernel_is_the_slope_of_its_cost(name):
 def test_a_width_is_above_zero(name):
     for width in (0.0, -1.0, np.nan, np.inf):
         with pytest.raises(
-            ValueError, match=f"^{graphs.KERNELS[name].__name__}: expected width above 0"
+            ValueError, match=f"^{graphs.KERNELS[name].__name__}: width: expected a number above 0"
         ):
             graphs.KERNELS[name](width)

@@ -161,7 +161,7 @@ def test_what_toro_cannot_hold_is_refused(tmp_path):
     posed = graph._replace(points=graph.points[:0], point_id=graph.point_id[:0])
     free = posed._replace(fixed_pose=np.zeros(2, bool))
     for lacking, message in (
-        (graph, "TORO has no line for points, and the graph has 1"),
+        (graph, "write_graph: graph: TORO has no line for points, and it has 1"),
         (posed, "TORO has no line for fixed poses, and pose 7 is fixed"),
         (free, "TORO has no line for table 'relative_position'; it has some for relative_pose"),
         (small_graphs.only(free, "prior"), "TORO has no line for table 'prior'"),

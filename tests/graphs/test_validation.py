@@ -101,28 +101,27 @@ def loose(graph, fixed=False, informed=True):
     ),
     (
         lambda g: g._replace(tables={"bearing": g.tables["relative_pose"]}),
-        r"table 'bearing': expected z of shape \(10, 1\), got \(10, 3\)",
+        r"table 'bearing': z: expected shape \(10, 1\), got \(10, 3\)",
     ),
     (
         lambda g: g._replace(tables={"odometer": g.tables["prior"]}),
         "table 'odometer' has no factor; there are: bearing, prior",
     ),
-    told="optimize: .*",
 )
 def test_what_is_refused(spoil):
-    graphs.check_graph("optimize", spoil(GRAPH), graphs.REGISTRY)
+    graphs.check_graph(spoil(GRAPH), graphs.REGISTRY)
 
 
 def test_what_is_not_valid_is_not_judged():
-    graphs.check_graph("optimize", GRAPH, graphs.REGISTRY)
+    graphs.check_graph(GRAPH, graphs.REGISTRY)
     graph = spoiled(small_graphs.drawn(), "relative_pose", "information", (9, 0, 0), -1.0)
     graph = spoiled(graph, "relative_pose", "who", 9, -7)
     graph = spoiled(graph, "relative_pose", "valid", 9, False)
-    graphs.check_graph("optimize", graph, graphs.REGISTRY)
+    graphs.check_graph(graph, graphs.REGISTRY)
 
 
 def test_parts_with_a_gauge_each_are_a_graph():
-    graphs.check_graph("optimize", loose(small_graphs.drawn(), fixed=True), graphs.REGISTRY)
+    graphs.check_graph(loose(small_graphs.drawn(), fixed=True), graphs.REGISTRY)
 
 
 def test_a_part_that_is_fixed_needs_no_gauge():
@@ -133,13 +132,13 @@ def test_a_part_that_is_fixed_needs_no_gauge():
         fixed_point=np.append(graph.fixed_point, True),
         point_id=np.append(graph.point_id, 99),
     )
-    graphs.check_graph("optimize", unseen, graphs.REGISTRY)
+    graphs.check_graph(unseen, graphs.REGISTRY)
     free = small_graphs.only(at(unseen, "fixed_pose", 0, False), "relative_pose")
     free = free._replace(points=unseen.points[-1:], fixed_point=np.ones(1, bool))
     free = free._replace(point_id=unseen.point_id[-1:])
     with pytest.raises(ValueError, match="the graph has no gauge"):
-        graphs.check_graph("optimize", free, graphs.REGISTRY)
-    graphs.check_graph("optimize", graphs.with_gauge(free), graphs.REGISTRY)
+        graphs.check_graph(free, graphs.REGISTRY)
+    graphs.check_graph(graphs.with_gauge(free), graphs.REGISTRY)
 
 
 def test_a_fixed_pose_that_nothing_joins_to_the_other_is_no_missing_gauge():
@@ -156,20 +155,20 @@ def test_a_fixed_pose_that_nothing_joins_to_the_other_is_no_missing_gauge():
         tables={"relative_pose": type(zero)(*(part[:1] for part in zero))},
     )
     with pytest.raises(ValueError, match=r"disconnected: .* joins pose 11 .*; 2 parts, 1 of"):
-        graphs.check_graph("optimize", two, graphs.REGISTRY)
+        graphs.check_graph(two, graphs.REGISTRY)
 
 
 def test_another_kind_of_number_is_refused():
     graph = small_graphs.drawn()
     table = graph.tables["prior"]
     for spoilt, message in (
-        (table._replace(valid=table.valid.astype(int)), "expected valid of bool, got int"),
-        (table._replace(who=table.who.astype(float)), "expected who of integers, got float"),
-        (table._replace(valid=table.valid.tolist()), "expected valid to be an array, got list"),
+        (table._replace(valid=table.valid.astype(int)), "valid: expected bool values, got int"),
+        (table._replace(who=table.who.astype(float)), "who: expected integer values, got float"),
+        (table._replace(valid=table.valid.tolist()), "valid: expected an array, got a list"),
     ):
         with pytest.raises(ValueError, match=f"table 'prior': {message}"):
             graphs.optimize(graph._replace(tables=graph.tables | {"prior": spoilt}))
-    with pytest.raises(ValueError, match="expected fixed_pose of bool, got int"):
+    with pytest.raises(ValueError, match="fixed_pose: expected bool values, got int"):
         graphs.optimize(graph._replace(fixed_pose=graph.fixed_pose.astype(int)))
 
 
@@ -198,7 +197,7 @@ def test_whole_numbers_are_real_ones():
 
 def test_a_tolerance_is_a_number_from_zero_on():
     for tolerance in (-1.0, np.nan):
-        with pytest.raises(ValueError, match="expected tolerance to be a finite number >= 0"):
+        with pytest.raises(ValueError, match="tolerance: expected a finite number >= 0"):
             graphs.optimize(small_graphs.drawn(), tolerance=tolerance)
 
 
@@ -206,7 +205,7 @@ def test_rounding_of_a_file_is_not_indefinite():
     graph = small_graphs.drawn()
     flat = np.diag([1e4, 1e4, -1e-3])
     graph = spoiled(graph, "relative_pose", "information", 0, flat)
-    graphs.check_graph("optimize", graph, graphs.REGISTRY)
+    graphs.check_graph(graph, graphs.REGISTRY)
 
 
 def test_the_first_pose_is_fixed_where_nothing_is():
@@ -233,33 +232,44 @@ def test_a_residual_of_another_shape_is_refused(residual, got):
     graph = small_graphs.only(small_graphs.drawn(), "prior")
     told = r"the factor 'mine' of table 'prior': expected a residual of shape \(3,\), as its errors"
     for use in (graphs.optimize, graphs.chi2, graphs.squared_residuals, graphs.plan):
-        with pytest.raises(ValueError, match=rf"graphs\.{use.__name__}: {told} .*, got {got}"):
+        with pytest.raises(
+            ValueError, match=rf"graphs\.{use.__name__}: factors: {told} .*, got {got}"
+        ):
             use(graph, factors)
 
 
 @refused(
-    (lambda: graphs.optimize("x.g2o"), "optimize: expected a Graph, .*, got 'x.g2o'"),
-    (lambda: graphs.chi2(None), "chi2: expected a Graph, .*, got a NoneType"),
-    (lambda: graphs.starts.chordal("x.g2o"), "starts: expected a Graph, .*, got 'x.g2o'"),
-    (lambda: graphs.plan(GRAPH.tables), "plan: expected a Graph, .*, got a dict"),
+    (lambda: graphs.optimize("x.g2o"), r"graphs\.optimize: graph: expected a Graph, got 'x\.g2o';"),
+    (
+        lambda: graphs.chi2(None),
+        r"graphs\.chi2: graph: expected a Graph, got None; datasets\.read_graph\(path\)",
+    ),
+    (
+        lambda: graphs.starts.chordal("x.g2o"),
+        r"chordal: graph: expected a Graph, got 'x\.g2o'; datasets\.read_graph\(path\)",
+    ),
+    (lambda: graphs.plan(GRAPH.tables), "plan: graph: expected a Graph, got a dict"),
     (
         lambda: graphs.optimize(GRAPH, kernel=graphs.DynamicCovarianceScaling),
-        r"optimize: expected a Kernel, as graphs.Huber\(\), got the class Dyn",
+        r"graphs\.optimize: kernel: expected a Kernel, got the class",
     ),
     (
         lambda: graphs.chi2(GRAPH, kernel={"bearing": "dcs"}),
-        r"chi2: expected a Kernel, as graphs.Huber\(\), got 'dcs'",
+        r"graphs\.chi2: kernel: expected a Kernel, got 'dcs'; graphs\.Huber\(\) is one",
     ),
     (
         lambda: graphs.optimize(GRAPH, {"bearing": graphs.Bearing}),
-        r"optimize: expected a Factor, as graphs.RelativePose\(\), got the class Bearing",
+        r"graphs\.optimize: factors: expected a Factor, got the class Bearing: call",
     ),
     (
         lambda: graphs.optimize(GRAPH, graphs.Bearing()),
-        "optimize: expected factors as a dict by table, got a Bearing",
+        r"graphs\.optimize: factors: expected a dict by table, got a Bearing",
     ),
     (lambda: graphs.optimize(GRAPH, iterations=-1), "iterations: expected an integer >= 0"),
-    (lambda: graphs.marginals(GRAPH), "marginals: expected a Solution, .* got a Graph"),
+    (
+        lambda: graphs.marginals(GRAPH),
+        r"graphs\.marginals: solution: expected a Solution, got a Graph; of a graph",
+    ),
 )
 def test_another_thing_than_the_argument_is_named(call):
     call()

@@ -319,14 +319,14 @@ def test_a_variance_of_rounding_is_zero_and_a_negative_one_is_not():
     near = np.diag([4.0, -1e-16])
     near[0, 1] = near[1, 0] = 3e-16
     assert not definite.indefinite(near) and not definite.invertible(near)
-    validation.require("thing", "", near, validation.covariance(2))
+    validation.require("thing", near, validation.covariance(2))
     assert definite.indefinite(np.diag([4.0, -1e-12]))
     assert not definite.indefinite(np.zeros((2, 2)))
     # Metres beside radians: an indefinite part hides behind no large entry.
     mixed = np.diag([1e6, 1e-4, 1e-4])
     mixed[1, 2] = mixed[2, 1] = 2e-4
     with pytest.raises(ValueError, match=r"thing: the covariance is not positive semi-definite"):
-        validation.require("thing", "", mixed, validation.covariance(3))
+        validation.require("thing", mixed, validation.covariance(3))
 
 
 # --- checks -------------------------------------------------------------------------------------
@@ -347,7 +347,7 @@ def test_a_variance_of_rounding_is_zero_and_a_negative_one_is_not():
     told="thing: ",
 )
 def test_check_covariance_refuses(value):
-    validation.require("thing", "", value, validation.covariance(2))
+    validation.require("thing", value, validation.covariance(2))
 
 
 @pytest.mark.parametrize(
@@ -361,12 +361,12 @@ def test_check_covariance_refuses(value):
     ids=["zero", "integers", "singular", "float32"],
 )
 def test_check_covariance_accepts(value):
-    validation.require("thing", "", value, validation.covariance(2))
+    validation.require("thing", value, validation.covariance(2))
 
 
 def test_check_covariance_sees_the_shape_of_a_tracer_and_no_more():
     def traced(cov, size):
-        validation.require("thing", "", cov, validation.covariance(size))
+        validation.require("thing", cov, validation.covariance(size))
         return cov
 
     assert jax.eval_shape(lambda c: traced(c, 2), -np.eye(2)).shape == (2, 2)
@@ -470,8 +470,8 @@ def test_a_square_and_its_slopes_are_those_of_the_product(rows):
 def test_a_key_is_one_prng_key():
     single = jax.random.key(0)
     for key in (single, jax.random.PRNGKey(0), np.asarray(jax.random.PRNGKey(0))):
-        validation.require("it", "", key, validation.prng_key)
-    jax.eval_shape(lambda key: validation.require("it", "", key, validation.prng_key), single)
+        validation.require("it", key, validation.prng_key)
+    jax.eval_shape(lambda key: validation.require("it", key, validation.prng_key), single)
     for key, shown in (
         (0, "got 0"),
         (None, "got None"),
@@ -479,4 +479,4 @@ def test_a_key_is_one_prng_key():
         (jax.random.split(single, 3), r"one PRNG key, got keys of shape \(3,\)"),
     ):
         with pytest.raises(ValueError, match=f"it: expected .*{shown}"):
-            validation.require("it", "", key, validation.prng_key)
+            validation.require("it", key, validation.prng_key)

@@ -329,14 +329,23 @@ def test_a_gate_is_a_probability_for_a_measurement_of_any_size(size):
         lambda: plainly(association.Nearest, *posed(*problem(np.random.default_rng(1), 3, 5))),
         "got a Prediction: as associate, give a rule with its gate, not its class$",
     ),
-    (lambda: association.MaximumLikelihood(0.99, 0.9), "new_gate >= gate"),
-    (lambda: association.GlobalNearest(0.99, 0.9), "new_gate >= gate"),
+    (
+        lambda: association.MaximumLikelihood(0.99, 0.9),
+        "new_gate: expected at least gate = 0.99, got 0.9",
+    ),
+    (
+        lambda: association.GlobalNearest(0.99, 0.9),
+        "new_gate: expected at least gate = 0.99, got 0.9",
+    ),
     (lambda: association.Nearest(0.99, ambiguous="guess"), "guess"),
     (
         lambda: association.JointCompatibility(1.5),
         "JointCompatibility: probability: expected a probability",
     ),
-    (lambda: association.JointCompatibility(0.99, 0.9), "new_gate >= gate"),
+    (
+        lambda: association.JointCompatibility(0.99, 0.9),
+        "new_gate: expected at least gate = 0.99, got 0.9",
+    ),
     (lambda: association.JointCompatibility(budget=0), "budget"),
     (lambda: association.JointCompatibility(candidates=0), "candidates"),
 )

@@ -432,7 +432,7 @@ def test_both_signs_are_one_set_of_points():
     (lambda s: filters.Merging(filters.EkfSlam(MOVES, s, 4), 0.5), "cannot be merged"),
     (
         lambda s: seen_points(s, Scan(jnp.zeros((1, 2)), jnp.zeros(1, int), jnp.ones(1, bool))),
-        "expected a sensor that measures points",
+        "seen_points: sensor: expected one that measures points, got line",
     ),
 )
 def test_what_is_for_points_refuses_lines(make):

@@ -165,9 +165,11 @@ def test_a_folder_that_cannot_be_used_is_refused_before_anything_is_drawn(
     monkeypatch.setattr(_campaign_files, "_drawings", lambda *a: pytest.fail("drawn"))
     monkeypatch.chdir(tmp_path)
     for folder in ("", " ", None):
-        with pytest.raises(ValueError, match=r"^Campaign.save: expected a folder, got "):
+        with pytest.raises(ValueError, match=r"^Campaign\.save: folder: expected a path, got"):
             campaign_of_two.save(folder)
-    with pytest.raises(ValueError, match=r"^Campaign.save: expected formats of .*, got None"):
+    with pytest.raises(
+        ValueError, match=r"^Campaign.save: figures: expected formats of .*, got None"
+    ):
         campaign_of_two.save("out", figures=None)
     assert not [*tmp_path.iterdir()]
     (tmp_path / "file").write_text("mine")

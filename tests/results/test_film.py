@@ -65,11 +65,11 @@ def test_frames_are_even_in_time_where_times_are_given():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ((0,), "animate: expected at least one step, got 0"),
+        ((0,), "animate: steps: expected an integer >= 1, got 0"),
         ((3, 0), "animate: frames: expected an integer >= 1, got 0"),
-        ((3, 2, np.zeros(2)), "animate: expected 3 finite times"),
-        ((3, 2, np.array([0.0, 2.0, 1.0])), "times that do not go back"),
-        ((3, 9, np.array([0.0, np.nan, 1.0])), "animate: expected 3 finite times"),
+        ((3, 2, np.zeros(2)), "animate: time: expected 3 finite ones"),
+        ((3, 2, np.array([0.0, 2.0, 1.0])), "ones that do not go back"),
+        ((3, 9, np.array([0.0, np.nan, 1.0])), "animate: time: expected 3 finite ones"),
     ],
 )
 def test_steps_that_cannot_be_chosen_are_refused(arguments, message):

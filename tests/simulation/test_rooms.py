@@ -212,34 +212,43 @@ def test_a_laser_and_its_world_hold_numbers_alone():
     (lambda: make_walls([[0, 0], [1, 0], [0, 1]], glass={(0, 1): 1.5}), "share in"),
     (
         lambda: rasterize(0.1, make_walls(circles=[[0, 0, 1]])),
-        "rasterize: expected Walls, got a float",
+        r"rasterize: world: expected Walls, got 0\.1",
     ),
     (lambda: make_walls(), "make_walls: expected at least one wall"),
     (
         lambda: make_walls(circles=[[1, 2]]),
-        r"expected circles \(x, y, radius\), got shape \(1, 2\)",
+        r"make_walls: circles: expected \(x, y, radius\), got shape \(1, 2\)",
     ),
     (
         lambda: make_walls([[0, 0], [1, 1]]),
-        "make_walls: expected chain 0 of at least three corners",
+        r"make_walls: chains: expected chain 0 of at least three corners \(x, y\), got",
     ),
     (
         lambda: make_walls(circles=[[0, 0, 0]]),
         "make_walls: expected finite numbers and radii above 0",
     ),
-    (lambda: Laser([]), "Laser: expected finite angles"),
-    (lambda: Laser([0.0], sigma=0.0), "Laser: expected sigma above 0"),
-    (lambda: Laser([0.0], max_range=np.inf), "Laser: expected max_range above 0, got inf"),
-    (lambda: Laser([0.0], dropout=2.0), "dropout in"),
-    (lambda: Laser([0.0], mount=(0, 0)), "Laser: expected a mounting pose of shape"),
-    (lambda: rasterize(square().walls, 0.0), "rasterize: expected a resolution"),
+    (lambda: Laser([]), r"Laser: angles: expected finite angles \(at least 1,\), got \(0,\)"),
+    (lambda: Laser([0.0], sigma=0.0), r"Laser: sigma: expected a number above 0, got 0\.0"),
+    (
+        lambda: Laser([0.0], max_range=np.inf),
+        "Laser: max_range: expected a number above 0, got inf",
+    ),
+    (lambda: Laser([0.0], dropout=2.0), r"Laser: dropout: expected a number from 0 to 1, got 2\.0"),
+    (
+        lambda: Laser([0.0], mount=(0, 0)),
+        r"Laser: mount: expected a mounting pose of shape \(3,\), got \(2,\)",
+    ),
+    (
+        lambda: rasterize(square().walls, 0.0),
+        r"rasterize: resolution: expected a number above 0, got 0\.0",
+    ),
     (
         lambda: scan_information(Laser([0.0], max_range=0.1), square().walls, [3, 3, 0]),
-        "scan_information: no beam from",
+        r"scan_information: pose: no beam from \[3\. 3\. 0\.\] meets a wall within",
     ),
     (
         lambda: scan_information(Laser([0.0]), square().walls, [3, 3]),
-        "scan_information: expected a pose",
+        r"scan_information: pose: expected \(x, y, θ\), got shape \(2,\)",
     ),
 )
 def test_bad_input_is_refused(call):
@@ -273,7 +282,7 @@ def test_segments_on_one_line_share_it():
 
 
 def test_rooms_without_segments_or_with_walls_of_no_thickness_are_refused():
-    with pytest.raises(ValueError, match="wall_lines: expected at least one segment"):
+    with pytest.raises(ValueError, match="wall_lines: world: expected at least one segment"):
         wall_lines(make_walls(circles=[[0, 0, 1]]))
     flat = make_walls([(0, 0), (4, 0), (2, 0)])
     with pytest.raises(ValueError, match="wall_lines: segment 0 has no free side"):
@@ -291,7 +300,7 @@ def test_a_scan_has_the_walls_in_view_and_no_other(make):
     assert (scan.z[scan.valid][:, 0] > -0.12).all()
     if make is square_lines:
         assert scan.valid.all()
-    with pytest.raises(ValueError, match=f"{world.name}: expected at most {world.steps} steps"):
+    with pytest.raises(ValueError, match=f"{world.name}: steps: expected at most {world.steps}"):
         make(world.steps + 1)
 
 

@@ -298,16 +298,16 @@ BLIND = changed(motion.Increment(Q), perturb=None)
     ({"controls": np.zeros(2)}, "controls: expected shape"),
     ({"controls": [[0.0, np.inf]]}, "controls: expected finite"),
     ({"controls": [["a", "b"]]}, "controls: expected finite"),
-    ({"pose": (0.0, 0.0)}, "pose: expected shape"),
+    ({"pose": (0.0, 0.0)}, "pose: expected finite numbers of shape"),
     ({"pose": (0.0, 0.0, np.nan)}, "pose: expected finite"),
     ({"pose_cov": np.eye(2)}, "pose_cov: expected a covariance"),
     ({"pose_cov": -np.eye(3)}, "pose_cov: .*positive semi-definite"),
-    ({"noise_on": "map"}, "expected noise_on"),
+    ({"noise_on": "map"}, 'noise_on: expected "robot" or'),
     ({"motion": sensors.RangeBearing(R)}, "motion: expected a Motion"),
-    ({"motion": BLIND, "noise_on": "odometry"}, "expected a motion with `perturb`"),
-    ({"places": 0}, "places >= 1"),
-    ({"places": -2}, "places >= 1"),
-    told="^Scenario 'test': .*",
+    ({"motion": BLIND, "noise_on": "odometry"}, "motion: expected one with `perturb`"),
+    ({"places": 0}, "places: expected an integer >= 1"),
+    ({"places": -2}, "places: expected an integer >= 1"),
+    told="^Scenario: ",
 )
 def test_inconsistent_scenarios_are_refused(changes):
     world(**changes)

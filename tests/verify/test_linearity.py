@@ -274,7 +274,7 @@ def test_inverse_depth_is_near_linear_where_range_is_not(share):
 
 
 @refused(
-    ({"x": np.eye(2)}, "state: expected shape"),
+    ({"x": np.eye(2)}, r"linearity_index: x: expected shape \(n,\), got \(2, 2\)"),
     ({"cov": np.eye(3)}, r"shape \(2, 2\)"),
     ({"cov": -np.eye(2)}, "negative variance"),
     ({"cov": np.diag([1.0, np.nan])}, "NaN"),

@@ -290,5 +290,8 @@ def test_only_the_named_factory_is_built(tmp_path):
     assert [t.name for t in user_files.load(f"{path}:good")] == ["good"]
     with pytest.raises(user_files.UnusableFile, match=r"factory bad: .*not finished"):
         user_files.load(f"{path}:bad")
-    with pytest.raises(user_files.UnusableFile, match=r"number: .*a Sensor, got int"):
+    with pytest.raises(
+        user_files.UnusableFile,
+        match="the factory number: factory: expected one of a Motion or a Sensor, got 3",
+    ):
         user_files.load(f"{path}:number")

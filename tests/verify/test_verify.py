@@ -280,12 +280,18 @@ def test_the_report_is_json_and_text():
     (lambda: verify_jacobians(lambda speed: speed), "the length of 'speed' is not known"),
     (
         lambda: verify_jacobians(observe, arguments={"landmarks": 2}),
-        "expected arguments of pose, landmark, got landmarks",
+        "observe: arguments: expected those of pose, landmark, got landmarks",
     ),
     (lambda: verify_jacobians(lambda: jnp.ones(2)), "a parameter to differentiate by"),
-    (lambda: verify_jacobians(observe, count=1), "count >= 2"),
+    (
+        lambda: verify_jacobians(observe, count=1),
+        "verify_jacobians: count: expected an integer >= 2, got 1",
+    ),
     (lambda: verify_jacobians(observe, tolerance=0.0), "above 0"),
-    (lambda: verify_jacobians(observe, states=[np.zeros((4, 3))]), "expected states of shapes"),
+    (
+        lambda: verify_jacobians(observe, states=[np.zeros((4, 3))]),
+        r"verify_jacobians: states: expected shapes \(S, 3\), \(S, 2\), got \[\(4, 3\)\]",
+    ),
     (
         lambda: verify_jacobians(lambda point: point, states=[np.zeros((4, 3))]),
         'the name point fixes 2 entries, which arguments={"point": 3} changes',
@@ -294,8 +300,14 @@ def test_the_report_is_json_and_text():
     (lambda: verify_jacobians(observe, arguments={"pose": 3.0}), "a tuple of names or their"),
     (lambda: verify_jacobians(observe, arguments={"pose": -1}), "expected a number of entries"),
     (lambda: verify_jacobians(observe, arguments=("pose", "l")), "name: entries"),
-    (lambda: verify_jacobians(observe, outputs="x [m]"), "outputs as a tuple"),
-    (lambda: verify_jacobians(observe, seed=-1), "a seed between"),
+    (
+        lambda: verify_jacobians(observe, outputs="x [m]"),
+        r"observe: outputs: expected a tuple of names, got 'x \[m\]'",
+    ),
+    (
+        lambda: verify_jacobians(observe, seed=-1),
+        "verify_jacobians: seed: expected a number between 0 and 2³²-1, got -1",
+    ),
 )
 def test_bad_requests_are_refused(call):
     call()

@@ -13,7 +13,7 @@ import jax
 
 from jaxslam._cli.common import OUT, check_out, chosen_devices
 from jaxslam.consistency.campaign._pieces import missing_pieces
-from jaxslam.core._numbers import check_count
+from jaxslam.core.validation import at_least, or_none, require
 from jaxslam.results import _campaign_files as campaign_files
 from jaxslam.results import store
 from jaxslam.results._block_files import MANIFEST, is_unfinished, read_manifest
@@ -57,8 +57,7 @@ def add_campaign_option(group: argparse._ArgumentGroup, name: str, text: str) ->
 def check_world_options(options: CampaignOptions) -> None:
     """Raise ValueError on numbers of steps or runs below 1, and on a seed out of range."""
     for name, count in (("steps", options.steps), ("runs", options.runs)):
-        if count is not None:
-            check_count(f"--{name}", count)
+        require(f"--{name}", count, or_none(at_least(1)))
     if not 0 <= options.seed < 2**32:
         raise ValueError(f"--seed: expected an integer from 0 to 2³²-1, got {options.seed}")
 
@@ -91,10 +90,9 @@ def spec_of(options: argparse.Namespace) -> Spec:
     """
     campaign, settings, block = _campaign(options)
     out = options.resume or options.out or OUT
-    formats = campaign_files.check_figure_formats("--figures", options.figures.split(","))
+    formats = require("--figures", options.figures.split(","), campaign_files.formats_of_figures)
     check_world_options(campaign)
-    if block is not None:
-        check_count("--block", block)
+    require("--block", block, or_none(at_least(1)))
     part = None
     if options.part is not None:
         match = re.fullmatch(r"(\d+)/(\d+)", options.part, re.ASCII)

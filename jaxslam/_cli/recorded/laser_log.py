@@ -24,11 +24,12 @@ from jaxslam._cli.common import (
     summary_table,
     write_results,
 )
+from jaxslam.core.validation import require
 from jaxslam.datasets import LaserLog
 from jaxslam.datasets._laser_logs.bag_messages import is_bag
 from jaxslam.laser.grids import Grid
 from jaxslam.math._odometry_jumps import odometry_jumps
-from jaxslam.results._campaign_files import FORMATS, check_figure_formats
+from jaxslam.results._campaign_files import FORMATS, formats_of_figures
 from jaxslam.results._files import Files, Json, json_text, versions
 
 
@@ -136,7 +137,7 @@ def run_job(work: Work, options: argparse.Namespace, command: str) -> int:
         value = getattr(options, name, 1)
         if not 0 < value < math.inf:
             raise ValueError(f"--{name.replace('_', '-')}: expected a number above 0, got {value}")
-    options.figures = check_figure_formats("--figures", options.figures.split(","))
+    options.figures = require("--figures", options.figures.split(","), formats_of_figures)
     if options.list:
         print(bag_text(options.path))
         return 0

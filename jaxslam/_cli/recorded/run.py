@@ -32,11 +32,12 @@ from jaxslam._cli.recorded.filter_run import FilterRun, run_filter
 from jaxslam.consistency._measures.counts import count_label
 from jaxslam.core.protocols import Filter
 from jaxslam.core.types import Estimate
+from jaxslam.core.validation import require
 from jaxslam.datasets import READERS, Dataset
 from jaxslam.datasets._evaluation import Evaluation
 from jaxslam.datasets._landmark_logs.table_settings import METHODS
 from jaxslam.results import report
-from jaxslam.results._campaign_files import FORMATS, check_figure_formats
+from jaxslam.results._campaign_files import FORMATS, formats_of_figures
 from jaxslam.results._files import Files, Json, json_text, versions
 
 
@@ -104,7 +105,7 @@ class RunPlan:
 
 def run_dataset(options: argparse.Namespace, command: str) -> int:
     """Run filters over the data set, print and write their results; returns the exit status."""
-    formats = check_figure_formats("--figures", options.figures.split(","))
+    formats = require("--figures", options.figures.split(","), formats_of_figures)
     plan = RunPlan.from_options(options)
     check_out(options.out, "run")
     runs = run_filters(plan)

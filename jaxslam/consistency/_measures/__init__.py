@@ -15,6 +15,7 @@ from jaxslam.consistency._measures import (
 )
 from jaxslam.consistency._measures.counts import MEANINGS
 from jaxslam.consistency._measures.measure import Measure
+from jaxslam.core.validation import InvalidField, refusals_of
 
 BUILT_IN: tuple[Measure, ...] = (
     *nees.MEASURES,
@@ -38,10 +39,11 @@ def register(measure: Measure) -> Measure:
     Raises ValueError where its key is one of this package's, or without a function of a run.
     """
     names = {name for m in BUILT_IN for name in (m.key, m.column)} | {*MEANINGS}
-    if measure.key in names:
-        raise ValueError(f"register: {measure.key!r} is the key of a measure of jaxslam")
-    if measure.of_run is None and type(measure) is Measure:
-        raise ValueError(f"register: measure {measure.key!r} has no of_run")
+    with refusals_of("register"):
+        if measure.key in names:
+            raise InvalidField("", f"{measure.key!r} is the key of a measure of jaxslam")
+        if measure.of_run is None and type(measure) is Measure:
+            raise InvalidField("", f"measure {measure.key!r} has no of_run")
     REGISTRY[measure.key] = measure
     return measure
 

@@ -14,6 +14,7 @@ from jaxslam.consistency._intervals import LEVEL
 from jaxslam.consistency._measures.measure import Measure, Nees, Runs, RunScores, Sums, ratio
 from jaxslam.core.protocols import Chart, Sensor
 from jaxslam.core.types import Trace, Truth
+from jaxslam.core.validation import InvalidField
 from jaxslam.math._pose_covariances import asymmetry, inverse_deviations
 from jaxslam.math.stats import chi2_quantiles
 
@@ -118,9 +119,11 @@ def block_nees(
     """
     shapes = [np.shape(array) for array in (pose, error, chart_error, cov)]
     if shapes != [pose.shape] * 3 + [(*pose.shape, 3)] or pose.shape[-1:] != (3,):
-        raise ValueError(
-            "block_nees: expected pose, error and chart_error of one shape (..., 3) and cov of "
-            f"(..., 3, 3), got {', '.join(map(str, shapes))}"
+        raise InvalidField(
+            "",
+            "expected pose, error and chart_error of one shape (..., 3) and cov of "
+            f"(..., 3, 3), got {', '.join(map(str, shapes))}",
+            owner="block_nees",
         )
     eps = float(np.finfo(cov.dtype).eps)
     # A covariance that is none may overflow; its steps are masked below.

@@ -31,6 +31,7 @@ from jaxslam.core._record import as_record
 from jaxslam.core._validation import reworded_tracer_errors
 from jaxslam.core.protocols import Candidate
 from jaxslam.core.types import Estimate, Info, Trace, Truth
+from jaxslam.core.validation import refusals_of
 from jaxslam.filters._ekf.monitor import MonitoredState
 from jaxslam.simulation._worlds import Scenario, World
 
@@ -123,11 +124,11 @@ class BlockRunner:
         plan, world, devices, numbers = self.plan, self._world, self._devices, self._numbers(0)
         draw, drive, bound, _ = self.programs
         try:
-            with reworded_tracer_errors(f"{world.name}: draw"):
+            with refusals_of(f"{world.name}: draw"), reworded_tracer_errors():
                 traced = draw.trace(world, self._key, numbers)
             draws: Draws = structs(start(draw, traced), devices)
             for name, candidate in self._filters.items():
-                with reworded_tracer_errors(f"monte_carlo: {name}"):
+                with refusals_of(f"monte_carlo: {name}"), reworded_tracer_errors():
                     traced = drive.trace(world, candidate, self._key, numbers, *draws)
                 results: FilterResults = structs(start(drive, traced), devices, RUN_AXES)
                 scored = world.sensor, draws[0], results.estimate, results.info

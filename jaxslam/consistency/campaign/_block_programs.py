@@ -36,9 +36,10 @@ from jaxslam.consistency._bound import jacobians_at_truth
 from jaxslam.consistency._measures.nees import chart_error_of
 from jaxslam.consistency._measures.observability import monitor_of
 from jaxslam.consistency._run_scores import run_statistics
-from jaxslam.consistency.campaign._candidates import cast_floats, check_fits, method_of
+from jaxslam.consistency.campaign._candidates import candidate_for, cast_floats, method_of
 from jaxslam.core.protocols import Candidate, Filter, Sensor
 from jaxslam.core.types import Estimate, Info, Log, Trace, Truth
+from jaxslam.core.validation import require
 from jaxslam.filters._ekf.monitor import Monitor
 from jaxslam.math._xla import hot_options, quick_options
 from jaxslam.simulation._worlds import BLOCK, World, run_keys
@@ -169,7 +170,7 @@ def drive_run(
     """The results of a filter, or an estimator, over the log of a run."""
     method, filter_key = method_of(candidate, truth), run_keys(key, number)[1]
     if isinstance(method, Filter):
-        check_fits(method.name, method, scenario)
+        require(f"filter {method.name}", method, candidate_for(scenario))
         chart, start = getattr(method, "chart", Euclidean()), (scenario.pose, scenario.pose_cov)
         trace = run(method, log, *start, filter_key, probe=_information_gained)
     else:

@@ -2,7 +2,7 @@
 
 import inspect
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -11,11 +11,12 @@ from jax.typing import DTypeLike
 from jaxtyping import PyTree
 from numpy.typing import ArrayLike
 
-from jaxslam.core._numbers import check_covariance, is_concrete
+from jaxslam.core._numbers import is_concrete
+from jaxslam.core._reprs import describe
 from jaxslam.core.logs._tables import split_unit
 from jaxslam.core.protocols import Candidate, Estimator, Filter, Motion, Sensor
 from jaxslam.core.types import Truth
-from jaxslam.core.validation import InvalidField
+from jaxslam.core.validation import Check, InvalidField, covariance, instance_of, require
 from jaxslam.graphs.smoothing._forward_pass import LogEstimator
 from jaxslam.math._definite import invertible
 from jaxslam.sensors._suite import Suite
@@ -25,14 +26,14 @@ _T = TypeVar("_T")
 
 
 def check_dtype(dtype: DTypeLike | None) -> np.dtype | None:
-    """The dtype of a campaign's worlds, or None; ValueError unless JAX is set to have it."""
+    """The dtype of a campaign's worlds, or None; InvalidField unless JAX is set to have it."""
     if dtype is None:
         return None
     wanted = jnp.dtype(dtype)
     if wanted not in (jnp.float32, jnp.float64):
-        raise ValueError(f"monte_carlo: expected a dtype float32 or float64, got {wanted}")
+        raise InvalidField("dtype", f"expected float32 or float64, got {wanted}")
     if wanted == jnp.float64 and jnp.result_type(float) != jnp.float64:
-        raise ValueError("monte_carlo: float64 needs jax.config.update('jax_enable_x64', True)")
+        raise InvalidField("dtype", "float64 needs jax.config.update('jax_enable_x64', True)")
     return wanted
 
 
@@ -47,7 +48,7 @@ def cast_floats(tree: _T, dtype: DTypeLike | None) -> _T:
 
 
 def check_noise(scenario: World) -> None:
-    """Raise ValueError if the noise of a model of the scenario is not a covariance.
+    """Raise InvalidField if the noise of a model of the scenario is not a covariance.
 
     A `noise_cov` that is a function can only be looked at where it is called. That of the motion is
     called for the start and the first control; a sensor's, and each part's of a suite, for
@@ -57,13 +58,13 @@ def check_noise(scenario: World) -> None:
         return
     motion = scenario.motion
     pose, control = _number(scenario.pose), _number(scenario.controls)[0]
-    _check_stated(motion.name, len(motion.noises), motion, pose, control)
+    _check_stated(motion, len(motion.noises), pose, control)
     for model in _sensors(scenario):
         size, nothing = len(model.measurements), _number(np.zeros(len(model.measurements)))
         try:
-            _check_stated(model.name, size, model, nothing)
+            _check_stated(model, size, nothing)
         except ValueError:
-            _check_stated(model.name, size, model, _first_measurement(model, scenario))
+            _check_stated(model, size, _first_measurement(model, scenario))
 
 
 def without_noise(scenario: World) -> str:
@@ -130,43 +131,31 @@ def _number(values: ArrayLike) -> np.ndarray:
     return np.asarray(values, jnp.result_type(float))
 
 
-def _check_stated(name: str, size: int, model: Motion | Sensor, *at: PyTree) -> None:
-    try:
-        check_covariance(name, _noise_cov(model, *at), size)
-    except InvalidField as error:
-        raise InvalidField("monte_carlo", f"noise_cov of {name}", error.reason) from None
+def _check_stated(model: Motion | Sensor, size: int, *at: PyTree) -> None:
+    require(f"noise_cov of {model.name}", _noise_cov(model, *at), covariance(size))
 
 
-def check_fits(name: str, candidate: Candidate, scenario: World) -> None:
-    """Raise ValueError unless a candidate fits the scenario's log."""
-    if isinstance(candidate, LogEstimator):
-        return
-    if isinstance(candidate, type):
-        got = f"the class {candidate.__name__}: call it"
-        raise ValueError(f"monte_carlo: expected {name} to be a filter, got {got}")
-    if not isinstance(candidate, Filter):
-        if not callable(candidate):
-            raise ValueError(
-                f"monte_carlo: expected {name} to be a Filter or a function of the truth, got "
-                f"{type(candidate).__name__}"
-            )
-        check_called(name, candidate)
-        try:
-            inspect.signature(candidate).bind(None)
-        except TypeError:
-            parameters = ", ".join(inspect.signature(candidate).parameters)
-            if parameters != "log, key":
-                raise ValueError(
-                    f"monte_carlo: {name!r} is a factory: call it, {name}({parameters})"
-                ) from None
-            raise ValueError(
-                f"monte_carlo: expected {name} to be a function of the truth alone; a function of "
-                "(log, key) is given as lambda truth: estimator"
-            ) from None
-        return
+def candidate_for(scenario: World) -> Check:
+    """The check of a filter for the scenario's log, or of a function of the truth."""
+
+    def check(value: Any) -> Candidate:
+        if isinstance(value, Filter):
+            _check_sizes(value, scenario)
+        elif isinstance(value, type) or not callable(value):
+            instance_of(Filter, "; a function of the truth is taken, too")(value)
+        elif not isinstance(value, LogEstimator):
+            _check_function(value)
+        candidate: Candidate = value
+        return candidate
+
+    return check
+
+
+def _check_sizes(filter: Filter, scenario: World) -> None:
+    """Raise ValueError unless a filter takes the controls, measurements and map of a scenario."""
     for field, expected, present in (
-        ("controls", candidate.controls, scenario.motion.controls),
-        ("measurements", candidate.measurements, scenario.sensor.measurements),
+        ("controls", filter.controls, scenario.motion.controls),
+        ("measurements", filter.measurements, scenario.sensor.measurements),
     ):
         # An entry without a unit fits any.
         pairs = zip(expected, present, strict=False)
@@ -174,33 +163,43 @@ def check_fits(name: str, candidate: Candidate, scenario: World) -> None:
         fit = all(len(pair) == 1 or None in pair for pair in units)
         if len(expected) != len(present) or not fit:
             raise ValueError(
-                f"monte_carlo: filter {name} takes {field} ({', '.join(expected)}), "
-                f"the scenario {scenario.name} gives ({', '.join(present)})"
+                f"it takes {field} ({', '.join(expected)}), the scenario {scenario.name} gives "
+                f"({', '.join(present)})"
             )
-
-    size, count = candidate.map_size, np.shape(scenario.landmarks)[0]
+    size, count = filter.map_size, np.shape(scenario.landmarks)[0]
     if size is not None and size != count:
         raise ValueError(
-            f"monte_carlo: filter {name} has a map of {size} landmarks, the scenario "
-            f"{scenario.name} has {count}; a map of some of them needs their tags"
+            f"it has a map of {size} landmarks, the scenario {scenario.name} has {count}; a map of "
+            "some of them needs their tags"
         )
 
 
-def check_called(name: str, candidate: Callable[..., object]) -> None:
-    """Raise ValueError if a candidate is a factory of filters instead of what one returns."""
-    first = next(iter(inspect.signature(candidate).parameters.values()), None)
-    if first is None:
-        return
-    ours = (getattr(candidate, "__module__", None) or "").partition(".")[0] == "jaxslam"
-    named = first.name in ("motion", "sensor", "robots", "scenario", "world")
-    if (ours and named) or first.annotation in (Motion, Sensor, World):
-        raise ValueError(f"monte_carlo: {name!r} is a factory: call it, {name}({first.name}, …)")
+def _check_function(candidate: Callable[..., object]) -> None:
+    """Raise ValueError on a factory of filters in place of what it returns, and on a function of
+    other arguments than the truth."""
+    parameters = list(inspect.signature(candidate).parameters.values())
+    if parameters:
+        first = parameters[0]
+        ours = (getattr(candidate, "__module__", None) or "").partition(".")[0] == "jaxslam"
+        named = first.name in ("motion", "sensor", "robots", "scenario", "world")
+        if (ours and named) or first.annotation in (Motion, Sensor, World):
+            raise ValueError(f"it is a factory of ({first.name}, …): call it")
+    try:
+        inspect.signature(candidate).bind(None)
+    except TypeError:
+        listed = ", ".join(parameter.name for parameter in parameters)
+        if listed != "log, key":
+            raise ValueError(f"it is a factory of ({listed}): call it") from None
+        raise ValueError(
+            "expected a function of the truth alone; a function of (log, key) is given as "
+            "lambda truth: estimator"
+        ) from None
 
 
 def method_of(candidate: Candidate, truth: Truth) -> Filter | Estimator:
     """A filter or an estimator: a candidate, or its result for the truth.
 
-    Raises ValueError where it fails on the truth, as a function of the world.
+    Raises InvalidField where it fails on the truth, as a function of the world.
     """
     if isinstance(candidate, Filter | LogEstimator):
         return candidate
@@ -208,13 +207,12 @@ def method_of(candidate: Candidate, truth: Truth) -> Filter | Estimator:
         method: Filter | Estimator = candidate(truth)
     except AttributeError as error:
         name = getattr(getattr(candidate, "function", candidate), "__name__", str(candidate))
-        raise ValueError(
-            f"monte_carlo: {name} was called with the truth (poses and landmarks) and fails: "
-            f"{error}; of a function of the scenario give what it returns, {name}(scenario)"
+        raise InvalidField(
+            "filters",
+            f"{name} was called with the truth (poses and landmarks) and fails: {error}; of a "
+            f"function of the scenario give what it returns, {name}(scenario)",
         ) from error
     if not callable(method) and not isinstance(method, Filter):
-        raise ValueError(
-            "monte_carlo: expected a function of the truth to return a filter or an estimator, got "
-            f"{type(method).__name__}"
-        )
+        reason = "expected a function of the truth to return a filter or an estimator, got "
+        raise InvalidField("filters", reason + describe(method))
     return method

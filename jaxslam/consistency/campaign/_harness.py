@@ -25,22 +25,31 @@ from jaxslam.consistency._tally import Tally
 from jaxslam.consistency.campaign._block import BOUND, CampaignPlan
 from jaxslam.consistency.campaign._block_programs import fitting_block
 from jaxslam.consistency.campaign._candidates import (
+    candidate_for,
     check_dtype,
-    check_fits,
     check_noise,
     method_of,
     without_noise,
 )
 from jaxslam.consistency.campaign._kept import Keep, add_kept
-from jaxslam.consistency.campaign._pieces import check_part, cores, in_part, missing_pieces
+from jaxslam.consistency.campaign._pieces import cores, in_part, missing_pieces, one_part
 from jaxslam.consistency.campaign._precision import precision_doubts
 from jaxslam.consistency.campaign._remote import Executor
 from jaxslam.consistency.campaign._result import Campaign, Incomplete, Interrupted
 from jaxslam.consistency.campaign._work import Work, show_progress
-from jaxslam.core._numbers import check_count, check_key, is_concrete
-from jaxslam.core._validation import check_record
+from jaxslam.core._numbers import is_concrete
+from jaxslam.core._reprs import describe
 from jaxslam.core.protocols import Candidate, Filter
 from jaxslam.core.types import Truth
+from jaxslam.core.validation import (
+    InvalidField,
+    at_least,
+    instance_of,
+    or_none,
+    prng_key,
+    refusals_of,
+    require,
+)
 from jaxslam.graphs.smoothing._forward_pass import LogEstimator
 from jaxslam.simulation._worlds import World, with_positions
 
@@ -111,7 +120,7 @@ def monte_carlo(
         Incomplete: where an executor computes no more, with the campaign so far.
     """
     # A user's transfer guard is there for loops of the user's; a campaign moves its numbers itself.
-    with jax.transfer_guard("allow"):
+    with jax.transfer_guard("allow"), refusals_of("monte_carlo"):
         _check(
             scenario, filters, runs, key, block, workers, devices, keep, part, progress, executor
         )
@@ -132,9 +141,10 @@ def monte_carlo(
         near, near_filters, origin = _near_the_origin(scenario, filters)
         plan = CampaignPlan(near, near_filters, key, devices, size, bound, dtype)
         if part is not None and (part[0] - 1) * plan.wide >= runs:
-            raise ValueError(
-                f"monte_carlo: part: expected one of the {-(-runs // plan.wide)} blocks of "
-                f"{plan.wide} runs that {runs} runs are, got part {part[0]} of {part[1]}"
+            raise InvalidField(
+                "part",
+                f"expected one of the {-(-runs // plan.wide)} blocks of "
+                f"{plan.wide} runs that {runs} runs are, got part {part[0]} of {part[1]}",
             )
         finished: list[tuple[int, int]] = []
         if keep is not None:
@@ -176,61 +186,46 @@ def _check(
     progress: object,
     executor: object,
 ) -> None:
-    """Raise ValueError on arguments that `monte_carlo` does not take."""
-    for name, value in (("runs", runs), ("block", block), ("workers", workers)):
-        if value is not None:
-            check_count(f"monte_carlo: {name}", value)
-    if part is not None:
-        check_part("monte_carlo: part", part)
-    check_record("monte_carlo", "scenario", scenario, World)
+    """Raise InvalidField on arguments that `monte_carlo` does not take."""
+    require("runs", runs, at_least(1))
+    require("block", block, or_none(at_least(1)))
+    require("workers", workers, or_none(at_least(1)))
+    require("part", part, or_none(one_part))
+    require("scenario", scenario, instance_of(World))
     if (most := scenario.recorded_runs) is not None and runs > most:
-        raise ValueError(
-            f"monte_carlo: runs: expected at most {most}, the recorded runs of {scenario.name}, "
-            f"got {runs}"
-        )
-    check_key("monte_carlo", key)
+        reason = f"expected at most {most}, the recorded runs of {scenario.name}, got {runs}"
+        raise InvalidField("runs", reason)
+    require("key", key, prng_key)
     if not isinstance(filters, Mapping) or not filters:
-        got = "none" if isinstance(filters, Mapping) else f"a {type(filters).__name__}"
-        raise ValueError(
-            f"monte_carlo: expected filters as {{name: filter}}, at least one, got {got}"
-        )
+        got = "none" if isinstance(filters, Mapping) else describe(filters)
+        raise InvalidField("filters", f"expected {{name: filter}}, at least one, got {got}")
     if not is_concrete(key):
-        raise ValueError("monte_carlo: it compiles its own programs: call it outside of jax.jit")
+        raise InvalidField("", "it compiles its own programs: call it outside of jax.jit")
     for name, candidate in filters.items():
         if not isinstance(name, str) or not name.strip() or not name.isprintable():
-            raise ValueError(
-                f"monte_carlo: filters: expected a name for each, as 'ekf', got {name!r}"
-            )
-        check_fits(name, candidate, scenario)
+            raise InvalidField("filters", f"expected a name for each, as 'ekf', got {name!r}")
+        require(f"filter {name}", candidate, candidate_for(scenario))
     check_noise(scenario)
     if devices is not None and not isinstance(devices, Sequence):
-        raise ValueError(
-            f"monte_carlo: expected devices as from jax.local_devices(), got {devices!r}"
-        )
+        reason = f"expected a sequence, as jax.local_devices(), got {devices!r}"
+        raise InvalidField("devices", reason)
     submits = callable(getattr(executor, "submit", None)) and not isinstance(executor, type)
     if executor is not None and not submits:
-        raise ValueError(
-            "monte_carlo: expected executor as of concurrent.futures, with a method submit, got "
-            f"{executor!r:.60}"
-        )
+        reason = f"expected one of concurrent.futures, with a method submit, got {executor!r:.60}"
+        raise InvalidField("executor", reason)
     if executor is not None and devices is not None:
-        raise ValueError(
-            "monte_carlo: devices: each worker of an executor uses its first device: expected none"
-        )
+        reason = "each worker of an executor uses its first device: expected none"
+        raise InvalidField("devices", reason)
     if devices is not None and not devices:
-        raise ValueError("monte_carlo: expected at least one device, got none")
+        raise InvalidField("devices", "expected at least one, got none")
     if keep is not None and not all(
         callable(getattr(keep, name, None)) for name in ("claim", "save", "blocks")
     ):
-        raise ValueError(
-            "monte_carlo: expected keep as from jaxslam.store.open(folder) or .resume(folder), "
-            f"got {keep!r}"
-        )
+        reason = f"expected jaxslam.store.open(folder) or .resume(folder), got {keep!r}"
+        raise InvalidField("keep", reason)
     if not (progress is None or progress is False or callable(progress)):
-        raise ValueError(
-            "monte_carlo: expected progress as a function of (runs done, runs), or False for none, "
-            f"got {progress!r}"
-        )
+        reason = f"expected a function of (runs done, runs), or False for none, got {progress!r}"
+        raise InvalidField("progress", reason)
 
 
 def summaries_of(tallies: dict[str, Tally]) -> tuple[int, np.ndarray, dict[str, Summary]]:

@@ -2,8 +2,10 @@
 
 import os
 from collections.abc import Iterable
+from typing import Any
 
 from jaxslam.core._numbers import is_whole
+from jaxslam.core.validation import InvalidField
 
 
 def missing_pieces(
@@ -15,7 +17,7 @@ def missing_pieces(
     finished: (first, runs) of finished pieces, in any order; may overlap and exceed runs.
     """
     if block < 1:
-        raise ValueError(f"block: expected an integer >= 1, got {block}")
+        raise InvalidField("block", f"expected an integer >= 1, got {block}")
     gaps, at = [], 0
     for first, count in [*sorted(finished), (runs, 0)]:
         gaps.append((at, min(first, runs)))
@@ -28,11 +30,13 @@ def missing_pieces(
     ]
 
 
-def check_part(name: str, part: object) -> None:
-    """Raise ValueError, which begins with a name, unless part is (i, n) with 1 <= i <= n."""
-    is_pair = isinstance(part, tuple) and len(part) == 2 and all(map(is_whole, part))
-    if not is_pair or not 1 <= part[0] <= part[1]:  # type: ignore[index]
-        raise ValueError(f"{name}: expected (i, n) with 1 <= i <= n, got {part!r}")
+def one_part(value: Any) -> tuple[int, int]:
+    """The check of a part (i, n) of a campaign, 1 <= i <= n."""
+    is_pair = isinstance(value, tuple) and len(value) == 2 and all(map(is_whole, value))
+    if not is_pair or not 1 <= value[0] <= value[1]:
+        raise ValueError(f"expected (i, n) with 1 <= i <= n, got {value!r}")
+    part: tuple[int, int] = value
+    return part
 
 
 def in_part(first: int, block: int, part: tuple[int, int] | None) -> bool:

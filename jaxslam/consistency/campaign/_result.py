@@ -57,7 +57,8 @@ class Campaign:
     def __post_init__(self) -> None:
         object.__setattr__(self, "filters", Named(self.filters))
         if self.reference and self.reference not in self.filters:
-            raise InvalidField("Campaign", "reference", self._unknown(self.reference))
+            reason = self._unknown(self.reference)
+            raise InvalidField("reference", reason, owner="Campaign")
 
     @property
     def size(self) -> str:

@@ -7,8 +7,9 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from jaxslam.core.types import Estimate
+from jaxslam.core.validation import InvalidField, refusals_of, require
 from jaxslam.laser.grids import Grid, entropy
-from jaxslam.laser.grids._grid import check_grid
+from jaxslam.laser.grids._grid import grid_map
 from jaxslam.math.numpy_poses import compose, wrapped
 
 
@@ -36,7 +37,8 @@ def ate(reference: ArrayLike, estimate: ArrayLike, *, align: bool = True) -> Pat
     Raises:
         ValueError: on tables that are not K >= 1 finite poses each.
     """
-    true, path = pose_pair("ate", reference, estimate)
+    with refusals_of("ate"):
+        true, path = pose_pair(reference, estimate)
     frame = alignment(path[:, :2], true[:, :2]) if align else np.zeros(3)
     path = transform(frame, path)
     gap = path - true
@@ -49,8 +51,9 @@ def alignment(source: ArrayLike, target: ArrayLike) -> Float[np.ndarray, "3"]:
     As `math.se2.align`, on the host in float64. source, target (N, 2); one point gives θ = 0.
     Raises ValueError on tables that are not N >= 1 finite points each.
     """
-    p, q = (_table("alignment", points, 2) for points in (source, target))
-    _same_length("alignment", p, q)
+    with refusals_of("alignment"):
+        p, q = _table("source", source, 2), _table("target", target, 2)
+        _check_lengths(p, q)
     p0, q0 = p.mean(axis=0), q.mean(axis=0)
     a, b = p - p0, q - q0
     theta = np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a * b).sum())
@@ -64,44 +67,45 @@ def transform(frame: ArrayLike, rows: ArrayLike) -> Float[np.ndarray, "K n"]:
     Headings are wrapped to (-π, π]. Raises ValueError on other shapes and on numbers that are not
     finite.
     """
-    pose = _table("transform", np.reshape(np.asarray(frame, np.float64), (1, -1)), 3)
-    table = _table("transform", rows, 3 if np.shape(rows)[-1:] == (3,) else 2)
+    with refusals_of("transform"):
+        pose = _table("frame", np.reshape(np.asarray(frame, np.float64), (1, -1)), 3)
+        table = _table("rows", rows, 3 if np.shape(rows)[-1:] == (3,) else 2)
     width = table.shape[1]
     return compose(pose, np.pad(table, ((0, 0), (0, 3 - width))))[:, :width]
 
 
 def pose_pair(
-    caller: str, reference: ArrayLike, estimate: ArrayLike
+    reference: ArrayLike, estimate: ArrayLike
 ) -> tuple[Float[np.ndarray, "K 3"], Float[np.ndarray, "K 3"]]:
-    """Both as finite tables (K, 3) in float64; else a ValueError that begins with the caller."""
-    true, path = (_table(caller, poses, 3) for poses in (reference, estimate))
-    _same_length(caller, true, path)
+    """Both as finite tables (K, 3) in float64; raises InvalidField on others."""
+    true, path = poses_of("reference", reference), poses_of("estimate", estimate)
+    _check_lengths(true, path)
     return true, path
 
 
-def poses_of(caller: str, poses: ArrayLike) -> Float[np.ndarray, "K 3"]:
-    """A finite table (K, 3) in float64; else a ValueError that begins with the caller."""
-    return _table(caller, poses, 3)
+def poses_of(argument: str, poses: ArrayLike) -> Float[np.ndarray, "K 3"]:
+    """A finite table (K, 3) in float64; raises InvalidField, with the argument, on others."""
+    return _table(argument, poses, 3)
 
 
-def _table(caller: str, values: ArrayLike, columns: int) -> Float[np.ndarray, "K n"]:
+def _table(argument: str, values: ArrayLike, columns: int) -> Float[np.ndarray, "K n"]:
     rows = "poses (x, y, θ)" if columns == 3 else "points (x, y)"
     try:
         table = np.asarray(values, np.float64)
     except (TypeError, ValueError):
-        raise ValueError(f"{caller}: expected a table of {rows}") from None
+        raise InvalidField(argument, f"expected a table of {rows}") from None
     if table.ndim != 2 or table.shape[1] != columns or len(table) == 0:
-        raise ValueError(f"{caller}: expected at least one of {rows}, got shape {table.shape}")
+        raise InvalidField(argument, f"expected at least one of {rows}, got shape {table.shape}")
     bad = ~np.isfinite(table).all(axis=1)
     if bad.any():
-        raise ValueError(f"{caller}: expected finite {rows}, row {int(np.argmax(bad))} is not")
+        raise InvalidField(argument, f"expected finite {rows}, row {int(np.argmax(bad))} is not")
     return table
 
 
-def _same_length(caller: str, a: np.ndarray, b: np.ndarray) -> None:
+def _check_lengths(a: np.ndarray, b: np.ndarray) -> None:
     if len(a) != len(b):
-        raise ValueError(
-            f"{caller}: expected tables of the same length, got {len(a)} and {len(b)} rows"
+        raise InvalidField(
+            "", f"expected tables of the same length, got {len(a)} and {len(b)} rows"
         )
 
 
@@ -116,7 +120,7 @@ def align_map(
     """
     named = np.asarray(estimate.alive) & (np.asarray(estimate.tag) >= 0)
     if not named.any():
-        raise ValueError("align_map: the map holds no tagged landmark")
+        raise InvalidField("estimate", "it has no tagged landmark", owner="align_map")
     points = np.asarray(estimate.points, np.float64)[named]
     targets = np.asarray(true_points, np.float64)[np.asarray(estimate.tag)[named]]
     pose = alignment(points, targets)
@@ -130,8 +134,9 @@ def map_entropy(grid: Grid) -> float:
     Unknown cells, which have 1 bit each (`grids.entropy`), are left out, so that it does not depend
     on how much is around the map. Raises ValueError on a grid that is none or has no known cell.
     """
-    check_grid("map_entropy", grid)
+    with refusals_of("map_entropy"):
+        require("grid", grid, grid_map)
     is_known = np.asarray(grid.log_odds) != 0
     if not is_known.any():
-        raise ValueError("map_entropy: no cell of the map is known")
+        raise InvalidField("grid", "it has no known cell", owner="map_entropy")
     return float(np.asarray(entropy(grid), np.float64)[is_known].mean())

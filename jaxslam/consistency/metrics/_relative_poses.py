@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from jaxslam.consistency.metrics._paths import PathErrors, pose_pair, poses_of
 from jaxslam.core.logs._streams import is_gap
-from jaxslam.core.validation import InvalidField
+from jaxslam.core.validation import InvalidField, positive, refusals_of, require
 from jaxslam.math.numpy_poses import between, wrapped
 
 Spacing = float | Sequence[float] | None
@@ -61,32 +61,35 @@ def relations(
         ValueError: unless exactly one spacing is given, and above 0; on poses that are none, and
             on stamps that are missing or go back.
     """
-    path = poses_of("relations", reference)
-    if sum(spacing is not None for spacing in (rows, seconds, metres)) != 1:
-        raise ValueError("relations: expected exactly one of rows, seconds and metres")
-    if (time is None) != (seconds is None):
-        raise ValueError("relations: expected the stamps, time=, with seconds= and nowhere else")
-    if rows is not None and not float(rows).is_integer():
-        raise ValueError(f"relations: expected a whole number of rows, got {rows}")
+    with refusals_of("relations"):
+        path = poses_of("reference", reference)
+        if sum(spacing is not None for spacing in (rows, seconds, metres)) != 1:
+            raise InvalidField("", "expected exactly one of rows, seconds and metres")
+        if (time is None) != (seconds is None):
+            raise InvalidField("", "expected the stamps, time=, with seconds= and nowhere else")
+        if rows is not None and not float(rows).is_integer():
+            raise InvalidField("rows", f"expected a whole number, got {rows}")
     at = distance_travelled(path) if seconds is None else np.asarray(time, np.float64)
     if rows is not None:
         at = np.arange(len(path), dtype=np.float64)
-    if at.shape != (len(path),):
-        raise ValueError(f"relations: expected stamps of shape ({len(path)},), got {at.shape}")
-    if not (rises := np.diff(at) >= 0).all():
-        row = int(rises.argmin())
-        raise ValueError(
-            f"relations: expected stamps that do not go back, got {at[row + 1]} in row {row + 1} "
-            f"after {at[row]}"
-        )
-    distance = next(spacing for spacing in (rows, seconds, metres) if spacing is not None)
-    spacings = np.atleast_1d(np.asarray(distance, np.float64))
-    if (
-        spacings.ndim != 1
-        or not len(spacings)
-        or not (np.isfinite(spacings) & (spacings > 0)).all()
-    ):
-        raise ValueError(f"relations: expected finite spacings above 0, got {distance}")
+    with refusals_of("relations"):
+        if at.shape != (len(path),):
+            raise InvalidField("time", f"expected shape ({len(path)},), got {at.shape}")
+        if not (rises := np.diff(at) >= 0).all():
+            row = int(rises.argmin())
+            raise InvalidField(
+                "time",
+                f"expected stamps that do not go back, got {at[row + 1]} in row {row + 1} "
+                f"after {at[row]}",
+            )
+        distance = next(spacing for spacing in (rows, seconds, metres) if spacing is not None)
+        spacings = np.atleast_1d(np.asarray(distance, np.float64))
+        if (
+            spacings.ndim != 1
+            or not len(spacings)
+            or not (np.isfinite(spacings) & (spacings > 0)).all()
+        ):
+            raise InvalidField("", f"expected finite spacings above 0, got {distance}")
     gaps = is_gap(at) if seconds is not None else np.zeros(len(path) - 1, bool)
     pairs = []
     for spacing in spacings:
@@ -107,9 +110,10 @@ def revisits(reference: ArrayLike, *, radius: float, apart: float) -> Relations:
 
     Raises ValueError on poses that are none, and on numbers that are not above 0.
     """
-    path = poses_of("revisits", reference)
-    if not (radius > 0 and apart > 0):
-        raise ValueError(f"revisits: expected numbers above 0, got {radius} and {apart}")
+    with refusals_of("revisits"):
+        path = poses_of("reference", reference)
+        require("radius", radius, positive)
+        require("apart", apart, positive)
     at = distance_travelled(path)
     before = np.searchsorted(at, at - apart, side="right")  # rows [0, before) are far enough back
     pairs = []
@@ -141,31 +145,23 @@ def relations_at_stamps(
         ValueError: on shapes that do not fit, stamps of the path that are not finite, a tolerance
             that is not a number of at least 0; and if no relation is kept, with both time ranges.
     """
-    stamps, of = np.asarray(time, np.float64), poses_of("relations_at_stamps", pose)
-    if stamps.ndim != 1 or not len(stamps) or not np.isfinite(stamps).all():
-        raise InvalidField(
-            "relations_at_stamps", "", f"expected finite stamps (K,), got {stamps.shape}"
-        )
-    if not tolerance >= 0:
-        raise InvalidField(
-            "relations_at_stamps", "", f"expected a tolerance of at least 0 s, got {tolerance}"
-        )
+    stamps = np.asarray(time, np.float64)
+    with refusals_of("relations_at_stamps"):
+        of = poses_of("pose", pose)
+        if stamps.ndim != 1 or not len(stamps) or not np.isfinite(stamps).all():
+            raise InvalidField("time", f"expected finite stamps (K,), got {stamps.shape}")
+        if not tolerance >= 0:
+            raise InvalidField("tolerance", f"expected at least 0 s, got {tolerance}")
+        for argument, values in (("first", first), ("second", second)):
+            end = np.asarray(values, np.float64)
+            if end.shape != (len(of),):
+                raise InvalidField(argument, f"expected {len(of)} stamps, got {end.shape}")
+            if not (finite := np.isfinite(end)).all():
+                row = int(finite.argmin())
+                reason = f"expected finite stamps, got {end[row]} in row {row}"
+                raise InvalidField(argument, reason)
     order = np.argsort(stamps, kind="stable")
     ordered = stamps[order]
-    for end in (np.asarray(first, np.float64), np.asarray(second, np.float64)):
-        if end.shape != (len(of),):
-            raise InvalidField(
-                "relations_at_stamps",
-                "",
-                f"expected {len(of)} stamps of relations, got {end.shape}",
-            )
-        if not (finite := np.isfinite(end)).all():
-            row = int(finite.argmin())
-            raise InvalidField(
-                "relations_at_stamps",
-                "",
-                f"expected finite stamps of relations, got {end[row]} in row {row}",
-            )
     ends = np.stack([first, second]).astype(np.float64)
     after = np.clip(np.searchsorted(ordered, ends), 0, len(ordered) - 1)
     before = np.maximum(after - 1, 0)
@@ -174,11 +170,11 @@ def relations_at_stamps(
     near = (np.abs(ordered[place] - ends) <= tolerance).all(axis=0)
     if not near.any():
         raise InvalidField(
-            "relations_at_stamps",
             "",
             f"none of {len(of):,} relations, from {ends.min():.6f} s to "
             f"{ends.max():.6f} s, joins the path, from {ordered[0]:.6f} s to {ordered[-1]:.6f} s, "
             f"within {tolerance:g} s at both ends",
+            owner="relations_at_stamps",
         )
     rows = order[place]
     return Relations(rows[0][near], rows[1][near], of[near]), int((~near).sum())
@@ -197,13 +193,12 @@ def relation_errors(of: Relations, estimate: ArrayLike) -> Errors:
 
     Raises ValueError on poses that are none, and on relations of rows that the path does not have.
     """
-    path = poses_of("relation_errors", estimate)
-    for rows in (of.first, of.second):
-        if len(rows) and not (rows.min() >= 0 and rows.max() < len(path)):
-            raise ValueError(
-                f"relation_errors: the relations are of rows up to {int(rows.max())}, and the path "
-                f"has {len(path)}"
-            )
+    with refusals_of("relation_errors"):
+        path = poses_of("estimate", estimate)
+        for rows in (of.first, of.second):
+            if len(rows) and not (rows.min() >= 0 and rows.max() < len(path)):
+                reason = f"of rows up to {int(rows.max())}, and the path has {len(path)}"
+                raise InvalidField("of", reason)
     gap = _between(path, of.first, of.second).pose - of.pose
     return Errors(np.hypot(gap[:, 0], gap[:, 1]), np.abs(wrapped(gap[:, 2])))
 
@@ -222,7 +217,8 @@ def rpe(
     Sturm et al. 2012, as in `ate`; row k of one path belongs to row k of the other. Raises
     ValueError as those two do.
     """
-    true, path = pose_pair("rpe", reference, estimate)
+    with refusals_of("rpe"):
+        true, path = pose_pair(reference, estimate)
     related = relations(true, rows=rows, seconds=seconds, metres=metres, time=time)
     return relation_errors(related, path)
 
@@ -259,7 +255,9 @@ def statistics(values: ArrayLike) -> Statistics:
     """
     kept = np.asarray(values, np.float64)
     if kept.ndim != 1 or not len(kept) or not np.isfinite(kept).all():
-        raise ValueError(f"statistics: expected finite errors (at least 1,), got {kept.shape}")
+        raise InvalidField(
+            "values", f"expected finite errors (at least 1,), got {kept.shape}", owner="statistics"
+        )
     return Statistics(
         size=len(kept),
         mean=float(kept.mean()),

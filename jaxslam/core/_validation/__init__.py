@@ -1,18 +1,8 @@
-"""Checks of arguments before tracing; each error is one line that states what was expected."""
+"""Checks of logs and models before tracing, and of the results of a user's filter, during it."""
 
-from jaxslam.core._numbers import (
-    check_count,
-    check_covariance,
-    check_key,
-    is_concrete,
-    shape_text,
-)
-from jaxslam.core._validation.logs import check_log
+from jaxslam.core._validation.logs import log_of
 from jaxslam.core._validation.models import (
     check_models,
-    check_motion,
-    check_record,
-    check_sensor,
     checked_estimate,
     motion_model,
     reworded_tracer_errors,
@@ -22,20 +12,12 @@ from jaxslam.core._validation.models import (
 )
 
 __all__ = [
-    "check_count",
-    "check_covariance",
-    "check_key",
-    "check_log",
     "check_models",
-    "check_motion",
-    "check_record",
-    "check_sensor",
     "checked_estimate",
-    "is_concrete",
+    "log_of",
     "motion_model",
     "reworded_tracer_errors",
     "same_state",
     "sensor_model",
-    "shape_text",
     "state_and_info",
 ]

@@ -160,10 +160,10 @@ def align_tables(
         when = seen.table.columns[TIME]
         lost = np.flatnonzero(inside & ~np.isin(when, clock))
         if lost.size and rule is streams.as_recorded:
-            raise ValueError(
-                f"{seen.table.at(int(lost[0]), TIME)}: expected a time of the odometry, since "
-                f"{', '.join(columns)} cannot be divided, got {when[lost[0]]:.12g}; poses can: "
-                f"{TIME}, {', '.join(POSE)}"
+            raise InvalidField(
+                seen.table.at(int(lost[0]), TIME),
+                f"expected a time of the odometry, since {', '.join(columns)} cannot be divided, "
+                f"got {when[lost[0]]:.12g}; poses can: {TIME}, {', '.join(POSE)}",
             )
         values = seen.table.values(seen.measured)
         ranges = [k for k, name in enumerate(seen.measured) if split_unit(name)[0] == "range"]
@@ -206,18 +206,19 @@ def _tags_in_scans(seen: Seen[_Name], tag_of: dict[_Name, int]) -> Int[np.ndarra
     scan: set[tuple[float, int]] = set()
     for row, pair in enumerate(zip(when.tolist(), tags, strict=True)):
         if pair[1] >= 0 and pair in scan:
-            raise ValueError(
-                f"{table.at(row, TAG)}: expected a tag once at a time, got "
-                f"{named[row]!r} twice at t = {pair[0]:.12g}"
+            raise InvalidField(
+                table.at(row, TAG),
+                f"expected a tag once at a time, got {named[row]!r} twice at t = {pair[0]:.12g}",
             )
         scan.add(pair)
     if (
         seen.places is not None
         and (late := np.flatnonzero(when[seen.places :] == when[: -seen.places])).size
     ):
-        raise ValueError(
-            f"{table.at(int(late[0]) + seen.places, TIME)}: expected at most {seen.places} "
-            f"measurement{'s' * (seen.places > 1)} at a time, the slots of the sensor, got more"
+        raise InvalidField(
+            table.at(int(late[0]) + seen.places, TIME),
+            f"expected at most {seen.places} measurement{'s' * (seen.places > 1)} at a time, the "
+            "slots of the sensor, got more",
         )
     return np.array(tags, np.int64)
 
@@ -230,8 +231,8 @@ def _too_soon(
     if not seen.spacing:
         return too_soon
     if unknown := np.flatnonzero(used & (tag < 0)).tolist():
-        where = seen.table.at(unknown[0], TAG)
-        raise ValueError(f"{where}: expected a tag, since a spacing is of one landmark, got none")
+        reason = "expected a tag, since a spacing is of one landmark, got none"
+        raise InvalidField(seen.table.at(unknown[0], TAG), reason)
     when = seen.table.columns[TIME]
     last: dict[int, float] = {}
     for row in np.flatnonzero(used):
@@ -271,7 +272,8 @@ def check_times(table: Columns[_Name], *, strict: bool) -> None:
     if back.size:
         before, at = time[back[0] : back[0] + 2].tolist()
         wanted = f"above {before}" if strict else f"of at least {before}"
-        raise ValueError(f"{table.at(int(back[0]) + 1, TIME)}: expected a time {wanted}, got {at}")
+        place = table.at(int(back[0]) + 1, TIME)
+        raise InvalidField(place, f"expected a time {wanted}, got {at}")
 
 
 DEGREES_OF_PATH = (
@@ -361,15 +363,13 @@ def columns_of(
     if names is None:
         without_axes = isinstance(table, np.ndarray) and table.ndim == 0
         if without_axes or not isinstance(table, Sequence | np.ndarray):
-            raise InvalidField(
-                argument, "", f"expected rows or columns, got {type(table).__name__}"
-            )
+            raise InvalidField(argument, f"expected rows or columns, got {type(table).__name__}")
         rows = [_held(row) for row in table]
         for k, row in enumerate(rows):
             size = len(row) if isinstance(row, Sequence) or np.ndim(row) else 1
             if size != len(needed) or isinstance(row, str):
                 reason = f"expected {len(needed)} values ({', '.join(needed)}), got {size}"
-                raise InvalidField(f"{argument}, row {k}", "", reason)
+                raise InvalidField(f"{argument}, row {k}", reason)
         cells = {name: [row[i] for row in rows] for i, name in enumerate(needed)}
         divisors: dict[str, float] = dict.fromkeys(needed, 1)
     else:
@@ -379,27 +379,23 @@ def columns_of(
         for name in needed:
             bare = split_unit(name)[0]
             if bare not in header:
-                raise InvalidField(
-                    argument, "", f"expected a column {name!r}, got {', '.join(names)}"
-                )
+                raise InvalidField(argument, f"expected a column {name!r}, got {', '.join(names)}")
             divisor = unit_divisor(split_unit(header[bare])[1], name)
             if divisor is None:
-                raise InvalidField(
-                    argument, "", f"expected the column {name!r}, got {header[bare]!r}"
-                )
+                raise InvalidField(argument, f"expected the column {name!r}, got {header[bare]!r}")
             column = _held(table[header[bare]])
             if not isinstance(column, Iterable):
-                raise InvalidField(argument, "", f"expected a column {name!r}, got {column!r}")
+                raise InvalidField(argument, f"expected a column {name!r}, got {column!r}")
             cells[name], divisors[name] = list(column), divisor
         lengths = {name: len(column) for name, column in cells.items()}
         if len(set(lengths.values())) > 1:
-            raise InvalidField(argument, "", f"expected columns of one length, got {lengths}")
+            raise InvalidField(argument, f"expected columns of one length, got {lengths}")
     tags = None
     if TAG in cells:
         tags = [_landmark(at(k, TAG), value) for k, value in enumerate(cells.pop(TAG))]
     columns = {n: _numbers(at, n, column, divisors[n]) for n, column in cells.items()}
     if not columns[TIME].size:
-        raise InvalidField(argument, "", "expected at least one row, got none")
+        raise InvalidField(argument, "expected at least one row, got none")
     return Columns(columns, tags, at)
 
 
@@ -431,7 +427,7 @@ def _numbers(
         except OverflowError:  # a whole number that no float holds
             quotient = math.nan
         if not math.isfinite(quotient):
-            raise ValueError(f"{at(row, name)}: expected a finite number, got {cell!r}")
+            raise InvalidField(at(row, name), f"expected a finite number, got {cell!r}")
         numbers[row] = quotient
     return numbers
 
@@ -466,7 +462,7 @@ def _landmark(place: str, value: object) -> int | str | None:
     if isinstance(value, float) and value.is_integer():
         value = int(value)
     if isinstance(value, bool) or not isinstance(value, int | str):
-        raise ValueError(f"{place}: expected a whole number or text, got {value!r}")
+        raise InvalidField(place, f"expected a whole number or text, got {value!r}")
     if isinstance(value, int) and value < 0:
-        raise ValueError(f"{place}: expected a number >= 0, or -1 for unknown, got {value}")
+        raise InvalidField(place, f"expected a number >= 0, or -1 for unknown, got {value}")
     return value

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxslam.core._noise import NoiseCov
-from jaxslam.core._numbers import check_covariance
 from jaxslam.core.logs._streams import as_recorded
 from jaxslam.core.types import Log
+from jaxslam.core.validation import InvalidField, covariance, require
 from jaxslam.datasets._dataset import Dataset
 from jaxslam.datasets._lines import TextFile, none_left
 from jaxslam.motion import PoseIncrement
@@ -213,8 +213,8 @@ class _RepeatedCov:
             self.cov[upper] = triangle
             self.cov.T[upper] = triangle
             try:
-                check_covariance("noise", self.cov, len(self.cov))
-            except ValueError as problem:
+                require("noise", self.cov, covariance(len(self.cov)))
+            except InvalidField as problem:
                 raise self.file.error(line, str(problem)) from problem
 
 

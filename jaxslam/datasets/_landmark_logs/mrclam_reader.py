@@ -11,6 +11,7 @@ from jaxslam.core._noise import NoiseCov
 from jaxslam.core._numbers import is_whole
 from jaxslam.core.logs._streams import Rows, hold
 from jaxslam.core.types import Log
+from jaxslam.core.validation import InvalidField, or_none, refusals_of, require
 from jaxslam.datasets._dataset import Dataset
 from jaxslam.datasets._landmark_logs.mrclam_robot import (
     DROP_REASONS,
@@ -19,11 +20,11 @@ from jaxslam.datasets._landmark_logs.mrclam_robot import (
     RobotCalibration,
     adjustable_of,
     associate,
-    check_calibration,
     log_of,
     models_of,
     read_landmarks,
     read_lines,
+    robot_calibration,
     true_fields,
 )
 from jaxslam.datasets._lines import none_left, stored_file
@@ -88,10 +89,10 @@ def mrclam(
             range, or a subject without survey; on a robot other than 1 to 5, and on a calibration
             of another kind.
     """
-    if not is_whole(robot) or robot not in ROBOTS:
-        raise ValueError(f"mrclam: expected a robot from 1 to 5, got {robot!r}")
-    if calibration is not None:
-        check_calibration("mrclam", calibration)
+    with refusals_of("mrclam"):
+        if not is_whole(robot) or robot not in ROBOTS:
+            raise InvalidField("robot", f"expected a number from 1 to 5, got {robot!r}")
+        require("calibration", calibration, or_none(robot_calibration))
     subject_of, names, points, corrections = read_landmarks(Path(folder), errata)
     lines = read_lines(Path(folder), robot, calibration)
     time = np.unique(np.concatenate([lines.odometry[:, 0], lines.measurements[:, 0]]))
@@ -153,19 +154,19 @@ def mrclam_team(
     """
     numbers = tuple(robots)
     good = all(is_whole(robot) and robot in ROBOTS for robot in numbers)
-    if not numbers or not good or len(set(numbers)) != len(numbers):
-        raise ValueError(f"mrclam_team: expected different robots from 1 to 5, got {robots!r}")
+    with refusals_of("mrclam_team"):
+        if not numbers or not good or len(set(numbers)) != len(numbers):
+            raise InvalidField("robots", f"expected different ones from 1 to 5, got {robots!r}")
+        calibrations: list[RobotCalibration | None] = [None] * len(numbers)
+        if isinstance(calibration, Mapping):
+            if missing := [robot for robot in numbers if robot not in calibration]:
+                raise InvalidField("calibration", f"robot {missing[0]} has none")
+            calibrations = [calibration[robot] for robot in numbers]
+        elif calibration is not None:
+            calibrations = [calibration] * len(numbers)
+        for constants in calibrations:
+            require("calibration", constants, or_none(robot_calibration))
     subject_of, names, points, corrections = read_landmarks(Path(folder), errata)
-    calibrations: list[RobotCalibration | None] = [None] * len(numbers)
-    if isinstance(calibration, Mapping):
-        if missing := [robot for robot in numbers if robot not in calibration]:
-            raise ValueError(f"mrclam_team: robot {missing[0]} has no calibration")
-        calibrations = [calibration[robot] for robot in numbers]
-    elif calibration is not None:
-        calibrations = [calibration] * len(numbers)
-    for constants in calibrations:
-        if constants is not None:
-            check_calibration("mrclam_team", constants)
     files = [
         read_lines(Path(folder), robot, constants)
         for robot, constants in zip(numbers, calibrations, strict=True)

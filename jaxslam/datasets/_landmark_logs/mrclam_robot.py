@@ -16,6 +16,7 @@ from jaxslam.core._numbers import is_concrete
 from jaxslam.core.logs._streams import hold, known_poses
 from jaxslam.core.protocols import Motion, Sensor
 from jaxslam.core.types import JaxOrNumPy, Log
+from jaxslam.core.validation import InvalidField, instance_of
 from jaxslam.datasets._dataset import Adjustable, Parameter
 from jaxslam.datasets._lines import TextFile, stored_file
 from jaxslam.motion import Unicycle, WhiteNoise
@@ -244,14 +245,12 @@ bearing, and by 1 % of the range once corrected. Persistent errors are included:
 the odometry is that of windows of 8 s, that of the camera of single measurements and the truth."""
 
 
-def check_calibration(name: str, calibration: object) -> None:
-    """Raise ValueError, which begins with the caller's name, unless it is a RobotCalibration of
-    finite numbers, its depth above 0, its noise not negative."""
-    if not isinstance(calibration, RobotCalibration):
-        raise ValueError(f"{name}: expected a RobotCalibration, got {type(calibration).__name__}")
-    for field, value in calibration._asdict().items():
+def robot_calibration(value: Any) -> RobotCalibration:
+    """The check of a calibration: finite numbers, its depth above 0, its noise not negative."""
+    calibration: RobotCalibration = instance_of(RobotCalibration)(value)
+    for field, entry in calibration._asdict().items():
         try:
-            number = float(value)
+            number = float(entry)
         except (TypeError, ValueError):
             number = np.nan
         good, expected = np.isfinite(number), "a finite number"
@@ -260,9 +259,8 @@ def check_calibration(name: str, calibration: object) -> None:
         elif field.endswith(("_noise", "_share")):
             good, expected = good and number >= 0, f"{expected} >= 0"
         if not good:
-            raise ValueError(
-                f"{name}: expected the {field} of a calibration to be {expected}, got {value!r}"
-            )
+            raise InvalidField(field, f"expected {expected}, got {entry!r}")
+    return calibration
 
 
 MAX_TRUTH_GAP = 0.2

@@ -21,13 +21,13 @@ from jaxslam.association import (
     Nearest,
 )
 from jaxslam.core._noise import NoiseCov
-from jaxslam.core._numbers import check_gate, is_number
+from jaxslam.core._numbers import is_number
 from jaxslam.core._record import record, static
 from jaxslam.core._units import TURN
 from jaxslam.core.logs._tables import INTERVAL, POSE, odometry_columns, split_unit
 from jaxslam.core.protocols import Associate, Motion, Sensor
 from jaxslam.core.types import JaxOrNumPy
-from jaxslam.core.validation import InvalidField
+from jaxslam.core.validation import InvalidField, or_none, probability, require
 from jaxslam.datasets._dataset import Parameter
 from jaxslam.math._definite import asymmetric, indefinite
 from jaxslam.motion import _odometry_errors as odometry_errors
@@ -114,20 +114,19 @@ def association_options(method: object, gate: Any, new_gate: Any = None) -> dict
         new_gate: the probability of the gate of new landmarks; by default `NEW_GATE`, or the gate
             if that is larger.
     """
-    check_gate("filter", gate)
+    require("gate", gate, or_none(probability))
     if not isinstance(method, str) or method not in METHODS:
-        reason = f"expected one of {', '.join(METHODS)}, got {method!r}"
-        raise InvalidField("filter", "associate", reason)
+        raise InvalidField("associate", f"expected one of {', '.join(METHODS)}, got {method!r}")
     if method == "known":
         if new_gate is not None:
-            raise InvalidField("filter", "new_gate", f"expected none of known tags, got {new_gate}")
+            raise InvalidField("new_gate", f"expected none of known tags, got {new_gate}")
         return {} if gate is None else {"gate": gate}
-    probability = GATE if gate is None else gate
-    beyond = max(probability, NEW_GATE) if new_gate is None else new_gate
+    own_gate = GATE if gate is None else gate
+    beyond = max(own_gate, NEW_GATE) if new_gate is None else new_gate
     try:
-        return {"associate": METHODS[method](probability, beyond)}
+        return {"associate": METHODS[method](own_gate, beyond)}
     except InvalidField as problem:
-        raise InvalidField("filter", "new_gate", problem.reason) from problem
+        raise InvalidField("new_gate", problem.reason) from problem
 
 
 FITTED = "fit.toml"

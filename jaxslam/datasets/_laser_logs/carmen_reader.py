@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from jaxslam.core.validation import InvalidField, finite, or_none, refusals_of, require
 from jaxslam.datasets._laser_logs.carmen_odometry import (
     RawOdometry,
     odometry_of_file,
@@ -31,7 +32,7 @@ from jaxslam.datasets._laser_logs.carmen_scans import (
     scan_of,
 )
 from jaxslam.datasets._laser_logs.laser_beams import beams_of
-from jaxslam.datasets._laser_logs.laser_record import LaserLog, check_given_mount, wrapped_path
+from jaxslam.datasets._laser_logs.laser_record import LaserLog, wrapped_path
 from jaxslam.datasets._lines import TextFile
 from jaxslam.math import numpy_poses as poses
 from jaxslam.math.numpy_poses import wrapped
@@ -94,9 +95,10 @@ def carmen(
             lines by more than 1 cm or ½°, and odometry that does not join. Also on a max_range
             that is not above 0, and a mount that is not three finite numbers.
     """
-    if not max_range > 0:
-        raise ValueError(f"carmen: expected a max_range above 0, got {max_range}")
-    given_mount = None if mount is None else check_given_mount("carmen", mount)
+    with refusals_of("carmen"):
+        if not max_range > 0:
+            raise InvalidField("max_range", f"expected a number above 0, got {max_range}")
+        given_mount = require("mount", mount, or_none(finite(3)))
     file = TextFile(path)
     lines = list(file)
     kind = _kind(file, Counter(fields[0] for _, fields in lines if is_scan(fields[0])), laser)

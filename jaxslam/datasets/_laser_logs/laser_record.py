@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from numpy.typing import ArrayLike
 
 from jaxslam.core.types import Beams
 
@@ -47,18 +46,6 @@ class LaserLog:
 
 MOUNT_TOLERANCE = 0.01, np.deg2rad(0.5)
 """Largest difference of the mount within a log [m], [rad]."""
-
-
-def check_given_mount(caller: str, mount: ArrayLike) -> Float[np.ndarray, "3"]:
-    """The mount as an array; ValueError unless it is three finite numbers."""
-    try:
-        frame = np.asarray(mount, float)
-    except (TypeError, ValueError):
-        frame = np.zeros(0)
-    if frame.shape != (3,) or not np.isfinite(frame).all():
-        text = " ".join(str(mount).split())
-        raise ValueError(f"{caller}: expected a mount of three finite numbers, got {text}")
-    return frame
 
 
 def differs_from_zero(pose: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
+from jaxslam.core.validation import InvalidField, finite, or_none, refusals_of, require
 from jaxslam.datasets._laser_logs.bag_messages import TRANSFORMS, Bag, Topic, open_bag
 from jaxslam.datasets._laser_logs.bag_transforms import (
     UPSIDE_DOWN,
@@ -30,7 +31,7 @@ from jaxslam.datasets._laser_logs.bag_transforms import (
     transforms_of,
 )
 from jaxslam.datasets._laser_logs.laser_beams import beams_of
-from jaxslam.datasets._laser_logs.laser_record import LaserLog, check_given_mount, wrapped_path
+from jaxslam.datasets._laser_logs.laser_record import LaserLog, wrapped_path
 from jaxslam.math import numpy_poses as poses
 from jaxslam.math._odometry_jumps import LONG, odometry_jumps, step_sizes
 
@@ -111,9 +112,10 @@ def rosbag(
             if rosbags is not installed, on a max_range that is not above 0, and a mount that is
             not three finite numbers.
     """
-    if not max_range > 0:
-        raise ValueError(f"rosbag: expected a max_range above 0, got {max_range}")
-    given_mount = None if mount is None else check_given_mount("rosbag", mount)
+    with refusals_of("rosbag"):
+        if not max_range > 0:
+            raise InvalidField("max_range", f"expected a number above 0, got {max_range}")
+        given_mount = require("mount", mount, or_none(finite(3)))
     corrections: list[str] = []
     source: list[str] = []  # notes on the source of odometry, after the notes on the scans
     dropped: Counter[str] = Counter()

@@ -125,16 +125,16 @@ class DelayedFilter(Filter):
     chart = Euclidean()
 
     def __post_init__(self) -> None:
-        name, sensor = type(self).__name__, self.sensor
+        sensor = self.sensor
         got = f"{sensor.name} with {sensor.measurements}"
         if len(sensor.measurements) != 1 or not sensor.of_points:
             reason = "expected a sensor of one bearing or one range of points (x, y), got "
-            raise InvalidField(name, "sensor", f"{reason}{got} of {sensor.landmark}")
+            raise InvalidField("sensor", f"{reason}{got} of {sensor.landmark}")
         triangulation = self.triangulation or triangulation_of(sensor)
         set_field(self, "triangulation", triangulation)
         if sensor.measurements != (triangulation.measurement,):
             reason = f"expected a sensor of one {triangulation.measurement}, got {got}"
-            raise InvalidField(name, "sensor", reason)
+            raise InvalidField("sensor", reason)
         super().__post_init__()
 
     @property

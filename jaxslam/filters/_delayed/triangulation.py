@@ -11,7 +11,7 @@ from jax import Array
 from jaxtyping import Bool, Float
 
 from jaxslam.core._numbers import is_concrete
-from jaxslam.core._record import record
+from jaxslam.core._record import field, record
 from jaxslam.core.protocols import Component, Sensor
 from jaxslam.math import se2
 from jaxslam.math._arrays import Number
@@ -55,6 +55,13 @@ class Triangulation(Component):
         raise NotImplementedError
 
 
+def _acute(value: Number) -> Number:
+    """The check of an angle in (0, π/2)."""
+    if is_concrete(value) and not 0 < np.asarray(value) < np.pi / 2:
+        raise ValueError(f"expected an angle in (0, π/2), got {value}")
+    return value
+
+
 @record
 class Rays(Triangulation):
     """Triangulation of bearings: rays p + t (cos q, sin q), t > 0, intersect in at most one point.
@@ -68,13 +75,9 @@ class Rays(Triangulation):
     Raises ValueError on a parallax out of range.
     """
 
-    parallax: Number = 0.1
+    parallax: Number = field(default=0.1, check=_acute)
     """[rad] in (0, π/2)"""
     measurement = "bearing [rad]"
-
-    def __post_init__(self) -> None:
-        _check_angle("Rays", "parallax", self.parallax)
-        super().__post_init__()
 
     def store(self, sensor: Sensor, pose: Float[Array, "3"], z: Float[Array, "1"]) -> Stored:
         # Two points of the ray: of the unmeasured numbers s = 0 and 1.
@@ -111,13 +114,9 @@ class Circles(Triangulation):
     Raises ValueError on an angle out of range.
     """
 
-    angle: Number = 0.3
+    angle: Number = field(default=0.3, check=_acute)
     """[rad] in (0, π/2)"""
     measurement = "range [m]"
-
-    def __post_init__(self) -> None:
-        _check_angle("Circles", "angle", self.angle)
-        super().__post_init__()
 
     def store(self, sensor: Sensor, pose: Float[Array, "3"], z: Float[Array, "1"]) -> Stored:
         # The sensor, wherever it is mounted, is halfway between the ends of a diameter.
@@ -155,11 +154,6 @@ class Circles(Triangulation):
 def triangulation_of(sensor: Sensor) -> Triangulation:
     """`Circles` for a sensor of ranges, else `Rays`."""
     return Circles() if sensor.measurements == (Circles.measurement,) else Rays()
-
-
-def _check_angle(name: str, field: str, angle: Number) -> None:
-    if is_concrete(angle) and not 0 < np.asarray(angle) < np.pi / 2:
-        raise ValueError(f"{name}: expected {field} in (0, π/2), got {angle}")
 
 
 def _unit(angle: Float[Array, ""]) -> Point:

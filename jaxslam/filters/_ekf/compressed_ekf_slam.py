@@ -12,7 +12,7 @@ from jaxslam.core._record import field, record, static
 from jaxslam.core.protocols import Sensor, Wrapper
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate, Info, Scan
-from jaxslam.core.validation import at_least, instance_of
+from jaxslam.core.validation import InvalidField, at_least, instance_of
 from jaxslam.filters._ekf.ekf_slam import EkfSlam
 from jaxslam.math import _linalg as linalg
 from jaxslam.math._xla import where_any
@@ -73,8 +73,7 @@ class CompressedEkfSlam(Wrapper):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        name, filter = "CompressedEkfSlam", self.filter
-        sensor = filter.sensor
+        filter, sensor = self.filter, self.filter.sensor
         joint = jax.eval_shape(filter.init, jnp.zeros(3), jnp.eye(3))
         for feature, is_unfit in {
             "a life": filter.life is not None,
@@ -92,7 +91,7 @@ class CompressedEkfSlam(Wrapper):
             ),
         }.items():
             if is_unfit:
-                raise ValueError(f"{name}: {feature} is not supported")
+                raise InvalidField("filter", f"{feature} is not supported")
 
     @property
     def name(self) -> str:  # type: ignore[override]
@@ -106,10 +105,8 @@ class CompressedEkfSlam(Wrapper):
 
     def update(self, state: _Compressed, scan: Scan, key: jax.Array) -> tuple[_Compressed, Info]:
         if len(scan.tag) > self.area:
-            raise ValueError(
-                f"CompressedEkfSlam: expected area >= {len(scan.tag)}, the measurement slots of "
-                f"a scan, got {self.area}"
-            )
+            reason = f"expected at least {len(scan.tag)}, as a scan has slots, got {self.area}"
+            raise InvalidField("area", reason, owner="CompressedEkfSlam")
         state = _with_area_of(scan, state, self.filter.sensor, self.filter.births)
         area, info = self._local.update(state.area, scan, key)
         # Slots of the area into slots of the map.

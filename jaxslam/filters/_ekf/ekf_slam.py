@@ -120,7 +120,7 @@ class EkfSlam(Filter):
     `Joint.life`; `info.extra["pruning"].removed` (N,) bool marks the slots"""
 
     def __post_init__(self) -> None:
-        check_fit(type(self).__name__, self.sensor, self.chart, self.linearize, self.iterations)
+        check_fit(self.sensor, self.chart, self.linearize, self.iterations)
         super().__post_init__()
 
     @property

@@ -9,6 +9,7 @@ from jaxtyping import Array, Float, PyTree
 from jaxslam.core._record import record
 from jaxslam.core.protocols import Filter, Wrapper
 from jaxslam.core.types import Estimate, Info, Scan
+from jaxslam.core.validation import InvalidField
 from jaxslam.filters._ekf.linear_system import LinearLandmarks, LinearMeasurements, LinearSystem
 from jaxslam.math import _linalg as linalg
 
@@ -61,9 +62,10 @@ class Monitored(Wrapper):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.filter.linearized is None:
-            raise ValueError(
-                f"Monitored: the steps of {self.filter.name} do not return the linear system they "
-                "use, as those of EkfSlam do; wrap that first"
+            raise InvalidField(
+                "filter",
+                f"the steps of {self.filter.name} do not return the linear system they "
+                "use, as those of EkfSlam do; wrap that first",
             )
 
     def init(self, pose: Array, pose_cov: Array) -> MonitoredState:

@@ -93,7 +93,7 @@ class Seif(InformationFilter):
         super().__post_init__()
         if not self.sensor.of_points:
             reason = f"expected landmarks (x, y), got {self.sensor.landmark} of {self.sensor.name}"
-            raise InvalidField("Seif", "sensor", reason)
+            raise InvalidField("sensor", reason)
 
     @property
     def active_size(self) -> int:
@@ -118,9 +118,10 @@ class Seif(InformationFilter):
     def update(self, state: SparseState, scan: Scan, key: Array) -> tuple[SparseState, Info]:
         size = scan.tag.shape[0]
         if size > self.active:
-            raise ValueError(
-                f"Seif: expected active >= {size}, the measurement slots of a scan, got "
-                f"{self.active}"
+            raise InvalidField(
+                "active",
+                f"expected a number >= {size}, the measurement slots of a scan, got {self.active}",
+                owner="Seif",
             )
         # Means are recovered before they are linearized at, so that Jacobians are up to date.
         state = recover_passive_means(state, self.recovered)

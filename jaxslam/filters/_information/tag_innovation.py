@@ -45,15 +45,15 @@ class InformationFilter(Filter):
     chart = Euclidean()
 
     def __post_init__(self) -> None:
-        name, sensor = type(self).__name__, self.sensor
+        sensor = self.sensor
         if isinstance(sensor, Suite):
-            raise InvalidField(name, "sensor", "expected one sensor, not a suite")
+            raise InvalidField("sensor", "expected one sensor, not a suite")
         if sensor.absolute:
             reason = f"expected a sensor of landmarks, got {sensor.name}"
-            raise InvalidField(name, "sensor", reason)
+            raise InvalidField("sensor", reason)
         if sensor.reduced is not None:
             reason = f"the landmarks of {sensor.name} are converted to points: not supported"
-            raise InvalidField(name, "sensor", reason)
+            raise InvalidField("sensor", reason)
         super().__post_init__()
 
 

@@ -32,7 +32,7 @@ class DeadReckoning(Filter):
     linearize: Linearizer = field(default=AtEstimate(), check=instance_of(Linearizer))
 
     def __post_init__(self) -> None:
-        check_fit("DeadReckoning", self.sensor, self.chart, self.linearize)
+        check_fit(self.sensor, self.chart, self.linearize)
         super().__post_init__()
 
     def init(self, pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"]) -> Joint:

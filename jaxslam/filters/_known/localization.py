@@ -27,7 +27,14 @@ from jaxslam.core.protocols import (
 )
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate, Info, Scan
-from jaxslam.core.validation import at_least, instance_of, one_of, or_none, probability
+from jaxslam.core.validation import (
+    InvalidField,
+    at_least,
+    instance_of,
+    one_of,
+    or_none,
+    probability,
+)
 from jaxslam.filters._ekf.checks import check_iterations
 from jaxslam.filters._ekf.correction import (
     Correction,
@@ -90,14 +97,12 @@ class Localization(Filter):
     """See `EkfSlam.covariance`."""
 
     def __post_init__(self) -> None:
-        name, linearize = "Localization", self.linearize
+        linearize = self.linearize
         hold_map(self)
         if linearize.own_landmarks:
-            raise ValueError(
-                f"{name}: the linearizer {linearize.name} is for estimated maps, not for a known "
-                "one"
-            )
-        check_iterations(name, linearize, self.iterations)
+            reason = f"{linearize.name} is for estimated maps, not for a known one"
+            raise InvalidField("linearize", reason)
+        check_iterations(linearize, self.iterations)
         super().__post_init__()
 
     @property

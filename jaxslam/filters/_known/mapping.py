@@ -16,7 +16,14 @@ from jaxslam.core._validation import sensor_model
 from jaxslam.core.protocols import Associate, Filter, Life, Sensor, Wrapper
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate, Info, Scan
-from jaxslam.core.validation import at_least, instance_of, or_none, probability
+from jaxslam.core.validation import (
+    InvalidField,
+    at_least,
+    instance_of,
+    or_none,
+    probability,
+    refusals_of,
+)
 from jaxslam.filters._particles.landmark_ekf import update_map
 from jaxslam.filters._particles.particle_map import ParticleMapFilter
 from jaxslam.filters._particles.proposal import associate_particle, propose_pose
@@ -122,23 +129,28 @@ def as_prior(
             memory.
     """
     if np.shape(pose) != (3,) or np.shape(pose_cov) != (3, 3):
-        raise ValueError(
-            f"as_prior: expected a pose (3,) and covariance (3, 3), got {np.shape(pose)} and "
-            f"{np.shape(pose_cov)}"
+        raise InvalidField(
+            "",
+            f"expected a pose (3,) and covariance (3, 3), got {np.shape(pose)} and "
+            f"{np.shape(pose_cov)}",
+            owner="as_prior",
         )
     capacity, size = state.landmarks.shape
     kind = state.landmarks.dtype
     joint = filter.init(jnp.asarray(pose, kind), jnp.asarray(pose_cov, kind))
-    if not isinstance(joint, Joint) or joint.landmarks.shape != (capacity, size):
-        raise ValueError(
-            f"as_prior: expected a filter of {capacity} landmarks with {size} parameters each, got "
-            f"{filter.name}"
-        )
-    if filter.chart.basis is not None or filter.square_root or jax.tree.leaves(joint.lin):
-        raise ValueError(
-            "as_prior: expected a filter in the Euclidean chart with a covariance, not its square "
-            "root, and with Jacobians at the estimate"
-        )
+    with refusals_of("as_prior"):
+        if not isinstance(joint, Joint) or joint.landmarks.shape != (capacity, size):
+            raise InvalidField(
+                "",
+                f"expected a filter of {capacity} landmarks with {size} parameters each, got "
+                f"{filter.name}",
+            )
+        if filter.chart.basis is not None or filter.square_root or jax.tree.leaves(joint.lin):
+            raise InvalidField(
+                "",
+                "expected a filter in the Euclidean chart with a covariance, not its square "
+                "root, and with Jacobians at the estimate",
+            )
     blocks = jnp.where(state.alive[:, None, None], state.covs, jnp.eye(size, dtype=kind)[None])
     # The rows of P of each landmark; only diagonal blocks are set: an uncorrelated prior.
     rows = 3 + jnp.arange(capacity)[:, None] * size + jnp.arange(size)[None, :]

@@ -96,8 +96,7 @@ class ParticleLocalization(MonteCarloFilter):
     def __post_init__(self) -> None:
         hold_map(self)
         if self.start == "uniform" and self.box is None:
-            name = type(self).__name__
-            raise InvalidField(name, "box", "expected one with a uniform start, got None")
+            raise InvalidField("box", "expected one with a uniform start, got None")
         super().__post_init__()
 
     @property

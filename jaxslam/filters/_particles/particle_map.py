@@ -25,7 +25,6 @@ class ParticleMapFilter(Filter):
         sensor = self.sensor
         if isinstance(sensor, Suite) or not sensor.landmark or sensor.reduced is not None:
             raise InvalidField(
-                type(self).__name__,
                 "sensor",
                 "expected one sensor of landmarks, not a suite, an absolute sensor or landmarks "
                 f"that are converted to points, got {sensor.name}",

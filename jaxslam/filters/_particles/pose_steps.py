@@ -167,11 +167,8 @@ class MonteCarloFilter(_Particles):
 
     def __post_init__(self) -> None:
         if self.least is not None and self.least > self.particles:
-            raise InvalidField(
-                type(self).__name__,
-                "least",
-                f"expected at most particles = {self.particles}, got {self.least}",
-            )
+            reason = f"expected at most particles = {self.particles}, got {self.least}"
+            raise InvalidField("least", reason)
         super().__post_init__()
 
     @property

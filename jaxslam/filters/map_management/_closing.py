@@ -5,12 +5,18 @@ import dataclasses
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxslam.core import _validation as validation
-from jaxslam.core._numbers import check_count, check_positive
-from jaxslam.core._record import record, static
+from jaxslam.core._record import field, record, static
 from jaxslam.core.protocols import Filter
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Info, Scan
+from jaxslam.core.validation import (
+    InvalidField,
+    at_least,
+    instance_of,
+    or_none,
+    positive,
+    refusals_of,
+)
 from jaxslam.filters._reporting import with_extra, with_removed
 from jaxslam.filters.map_management._loop_closure import (
     LoopSettings,
@@ -42,34 +48,29 @@ class Closing(Managed):
     """a filter that keeps times and associates without tags, as
     `EkfSlam(…, associate=association.Certain(…), life=life.Recency())`"""
     _: dataclasses.KW_ONLY
-    period: int = static(default=1)
+    period: int = static(default=1, check=at_least(1))
     """number of scans from one search to the next"""
-    reach: Number | None = None
+    reach: Number | None = field(default=None, check=or_none(positive))
     """[m] distance below which two landmarks, one of which was initialized after the last
     measurement of the second, are merged if δ = 0 is within 99 % and √(tr cov(δ)/2) is at most
     spread, one pair a scan: so duplicates that were initialized before the loop closed are merged
     too. None merges none"""
-    spread: Number = 0.5
+    spread: Number = field(default=0.5, check=positive)
     """[m] see reach"""
-    settings: LoopSettings = static(default=LoopSettings())
+    settings: LoopSettings = static(default=LoopSettings(), check=instance_of(LoopSettings))
     """settings of the search"""
 
     def __post_init__(self) -> None:
-        validation.check_record("Closing", "settings", self.settings, LoopSettings)
         super().__post_init__()
-        check_count("Closing: period", self.period)
-        check_positive("Closing", spread=self.spread)
-        if self.reach is not None:
-            check_positive("Closing", reach=self.reach)
         if self.filter.square_root:
-            raise ValueError(
-                f"Closing: expected a filter that keeps its covariance, got {self.filter.name}, "
-                "which keeps the square root of it"
-            )
+            name = self.filter.name
+            reason = f"expected one that keeps its covariance, got {name}, which keeps its root"
+            raise InvalidField("filter", reason)
 
     def init(self, pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"]) -> Joint:
         joint = super().init(pose, pose_cov)
-        check_recency("Closing", joint)
+        with refusals_of("Closing"):
+            check_recency(joint)
         return joint
 
     def manage(self, joint: Joint, scan: Scan, info: Info) -> tuple[Joint, Info]:

@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxslam.core._numbers import check_count
 from jaxslam.core.slots import Joint
+from jaxslam.core.validation import InvalidField, at_least, in_range, require
 from jaxslam.filters.map_management._point_pairs import (
     PointSets,
     equal_lengths,
@@ -168,30 +168,25 @@ class _SearchLimits(NamedTuple):
     candidates: int
 
 
-def check_point_map(caller: str, joint: Joint) -> None:
-    """Raise ValueError unless landmarks are points and the state keeps no earlier poses."""
+def check_point_map(joint: Joint) -> None:
+    """Raise InvalidField unless landmarks are points and the state keeps no earlier poses."""
     if joint.landmarks.shape[1] != 2:
-        raise ValueError(
-            f"{caller}: expected landmarks (x, y), got {joint.landmarks.shape[1]} parameters each"
-        )
+        size = joint.landmarks.shape[1]
+        raise InvalidField("joint", f"expected landmarks (x, y), got {size} parameters each")
     if jax.tree.leaves(joint.lin):
-        raise ValueError(f"{caller}: a linearizer that keeps former estimates is not supported")
+        raise InvalidField("joint", "a linearizer that keeps former estimates is not supported")
 
 
-def check_policy(caller: str, least: int, margin: int) -> None:
-    """Raise ValueError unless least >= 3 and margin >= 1: two points fit too often by chance."""
-    check_count(f"{caller}: least", least)
-    check_count(f"{caller}: margin", margin)
-    if least < 3:
-        raise ValueError(f"{caller}: expected least >= 3, got {least}")
+def check_search(least: int, margin: int, probability: float, pairs: int, candidates: int) -> None:
+    """Raise InvalidField on settings of a search that are out of range.
 
-
-def check_search(caller: str, probability: float, pairs: int, candidates: int) -> None:
-    """Raise ValueError on a probability not between 0 and 1, or pairs or candidates below 1."""
-    if not 0 < probability < 1:
-        raise ValueError(f"{caller}: expected a probability between 0 and 1, got {probability}")
-    check_count(f"{caller}: pairs", pairs)
-    check_count(f"{caller}: candidates", candidates)
+    least is 3 or more, since two points fit too often by chance.
+    """
+    require("least", least, at_least(3))
+    require("margin", margin, at_least(1))
+    require("probability", probability, in_range(0.0, 1.0, open=True))
+    require("pairs", pairs, at_least(1))
+    require("candidates", candidates, at_least(1))
 
 
 def search_limits(size: int, probability: float, pairs: int, candidates: int) -> _SearchLimits:

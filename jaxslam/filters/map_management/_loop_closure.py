@@ -9,14 +9,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from jaxslam.core._numbers import check_count
 from jaxslam.core.protocols import Chart
 from jaxslam.core.slots import Joint
+from jaxslam.core.validation import InvalidField, at_least, in_range, refusals_of, require
 from jaxslam.filters._ekf.map_coordinates import cov_of_coordinates
 from jaxslam.filters.map_management._geometric_matching import (
     GeometricMatch,
     check_point_map,
-    check_policy,
     check_search,
     match_points,
     search_limits,
@@ -131,22 +130,19 @@ class LoopSettings:
     """number of best agreeing pairs of old landmarks tried with each of these"""
 
     def __post_init__(self) -> None:
-        for name in ("window", "cluster", "sightings"):
-            check_count(f"LoopSettings: {name}", getattr(self, name))
-        check_policy("LoopSettings", self.least, self.margin)
-        if not 0 < self.drift < 1:
-            raise ValueError(f"LoopSettings: expected a drift between 0 and 1, got {self.drift}")
-        check_search("LoopSettings", self.probability, self.pairs, self.candidates)
+        with refusals_of("LoopSettings"):
+            for name in ("window", "cluster", "sightings"):
+                require(name, getattr(self, name), at_least(1))
+            require("drift", self.drift, in_range(0.0, 1.0, open=True))
+            check_search(self.least, self.margin, self.probability, self.pairs, self.candidates)
 
 
-def check_recency(caller: str, joint: Joint) -> None:
-    """Raise ValueError unless landmarks are points and their times are kept (`life.Recency`)."""
-    check_point_map(caller, joint)
+def check_recency(joint: Joint) -> None:
+    """Raise InvalidField unless landmarks are points and their times are kept (`life.Recency`)."""
+    check_point_map(joint)
     if not isinstance(joint.life, Times):
-        raise ValueError(
-            f"{caller}: expected a filter that keeps times of landmarks, as EkfSlam(…, "
-            "life=life.Recency())"
-        )
+        reason = "expected that of a filter that keeps times, as EkfSlam(…, life=life.Recency())"
+        raise InvalidField("joint", reason)
 
 
 def close_loop(joint: Joint, chart: Chart, settings: LoopSettings) -> tuple[Joint, LoopReport]:
@@ -170,7 +166,8 @@ def close_loop(joint: Joint, chart: Chart, settings: LoopSettings) -> tuple[Join
         ValueError: on a life that is not recency, or landmarks or a linearizer that `lost`
             refuses.
     """
-    check_recency("close_loop", joint)
+    with refusals_of("close_loop"):
+        check_recency(joint)
     times: Times = joint.life
     capacity = joint.landmarks.shape[0]
     is_recent = joint.alive & (times.now - times.last <= settings.window)

@@ -10,13 +10,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from jaxslam.core import _validation as validation
 from jaxslam.core import slots
-from jaxslam.core._numbers import check_positive, is_concrete
-from jaxslam.core._record import record, static
+from jaxslam.core._record import field, record, static
+from jaxslam.core._validation import state_and_info
 from jaxslam.core.protocols import Chart, Filter, Wrapper
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Info, Scan, Status
+from jaxslam.core.validation import InvalidField, in_range, positive, refusals_of, require
 from jaxslam.filters._ekf.linear_system import LinearizedSteps, LinearSystem
 from jaxslam.filters._ekf.map_coordinates import retract_map
 from jaxslam.filters._reporting import with_extra
@@ -45,9 +45,10 @@ class Managed(Wrapper):
     def init(self, pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"]) -> Joint:
         joint = self.filter.init(pose, pose_cov)
         if not isinstance(joint, Joint):
-            raise ValueError(
-                f"{type(self).__name__}: expected a filter whose state is a slots.Joint, as of "
-                f"EkfSlam, got {self.filter.name}"
+            raise InvalidField(
+                "filter",
+                f"expected one whose state is a slots.Joint, as of EkfSlam, got {self.filter.name}",
+                owner=type(self).__name__,
             )
         return joint
 
@@ -67,8 +68,8 @@ class Managed(Wrapper):
         return LinearizedSteps(steps.predict, update)
 
     def _manage(self, joint: Joint, scan: Scan, result: PyTree) -> tuple[Joint, Info]:
-        name = f"{type(self).__name__}: {self.filter.name}"
-        joint, info = validation.state_and_info(name, joint, scan, result)
+        with refusals_of(f"{type(self).__name__}: {self.filter.name}"):
+            joint, info = state_and_info(joint, scan, result)
         return self.manage(joint, scan, info)
 
 
@@ -99,23 +100,21 @@ class Merging(Managed):
 
     filter: Filter
     """a filter whose state is a `slots.Joint`"""
-    reach: Number
+    reach: Number = field(check=positive)
     """[m] less than the distance of any two true landmarks. The test alone cannot separate two
     landmarks whose difference is less certain than their distance"""
-    probability: float = static(default=0.95)
+    probability: float = static(default=0.95, check=in_range(0.0, 1.0, open=True))
     """probability that two estimates of one landmark pass the test"""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_positive("Merging", reach=self.reach)
-        if not 0 < self.probability < 1:
-            raise ValueError(f"Merging: expected 0 < probability < 1, got {self.probability}")
         names = self.filter.landmark
         unique = len(names) > 1 and all(name.endswith("[m]") for name in names[:2])
         if not unique or "rho [1/m]" in names:
-            raise ValueError(
-                f"Merging: landmarks of {self.filter.name} with parameters {names} cannot be "
-                "merged: equal parameters do not mean equal positions"
+            raise InvalidField(
+                "filter",
+                f"landmarks of {self.filter.name} with parameters {names} cannot be "
+                "merged: equal parameters do not mean equal positions",
             )
 
     def init(self, pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"]) -> Joint:
@@ -175,13 +174,12 @@ def closest_pair(
     Raises ValueError on a reach not above 0, or allowed of another shape.
     """
     capacity, size = joint.landmarks.shape
-    if is_concrete(reach) and not reach > 0:
-        raise ValueError(f"closest_pair: expected a reach above 0, got {reach}")
-    if allowed is not None and jnp.shape(allowed) != (capacity, capacity):
-        raise ValueError(
-            f"closest_pair: expected allowed of shape {(capacity, capacity)}, "
-            f"got {jnp.shape(allowed)}"
-        )
+    with refusals_of("closest_pair"):
+        require("reach", reach, positive)
+        if allowed is not None and jnp.shape(allowed) != (capacity, capacity):
+            raise InvalidField(
+                "allowed", f"expected shape {(capacity, capacity)}, got {jnp.shape(allowed)}"
+            )
     delta = joint.landmarks[:, None] - joint.landmarks[None, :]
     by_robot, by_landmark = _derivatives(joint, chart)
     p = joint.cov @ joint.cov.T if square_root else joint.cov

@@ -7,16 +7,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from jaxslam.core._numbers import check_covariance
 from jaxslam.core.protocols import Chart, Sensor
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Scan
+from jaxslam.core.validation import InvalidField, array_of, covariance, refusals_of, require
 from jaxslam.filters._ekf.map_coordinates import cov_of_coordinates, with_cov_of_coordinates
 from jaxslam.filters.map_management._geometric_matching import (
     GeometricMatch,
     align_points,
     check_point_map,
-    check_policy,
     check_search,
     match_points,
     search_limits,
@@ -55,7 +54,8 @@ def seen_points(sensor: Sensor, scan: Scan) -> tuple[Float[Array, "M 2"], Float[
     """
     no_place = len(sensor.landmark) == 0 or sensor.carry is not None
     if no_place or np.shape(sensor.free.mean)[0] > 0:
-        raise ValueError(f"seen_points: expected a sensor that measures points, got {sensor.name}")
+        reason = f"expected one that measures points, got {sensor.name}"
+        raise InvalidField("sensor", reason, owner="seen_points")
     z = jnp.where(scan.valid[:, None], scan.z, 0.0)
     origin, unmeasured = jnp.zeros(3, z.dtype), jnp.zeros(0, z.dtype)
 
@@ -110,12 +110,18 @@ def relocalize(
     points, cov, alive = jnp.asarray(points), jnp.asarray(cov), jnp.asarray(alive)
     seen, seen_covs, valid = jnp.asarray(seen), jnp.asarray(seen_covs), jnp.asarray(valid)
     n, m = np.shape(points)[0], np.shape(seen)[0]
-    expected = ((points, (n, 2)), (cov, (2 * n, 2 * n)), (alive, (n,)), (seen, (m, 2)))
-    for value, shape in (*expected, (seen_covs, (m, 2, 2)), (valid, (m,))):
-        if np.shape(value) != shape:
-            raise ValueError(f"relocalize: expected shape {shape}, got {np.shape(value)}")
-    check_policy("relocalize", least, margin)
-    check_search("relocalize", probability, pairs, candidates)
+    arrays = (
+        ("points", points, (n, 2)),
+        ("cov", cov, (2 * n, 2 * n)),
+        ("alive", alive, (n,)),
+        ("seen", seen, (m, 2)),
+        ("seen_covs", seen_covs, (m, 2, 2)),
+        ("valid", valid, (m,)),
+    )
+    with refusals_of("relocalize"):
+        for argument, value, shape in arrays:
+            require(argument, value, array_of(*shape))
+        check_search(least, margin, probability, pairs, candidates)
     if n < 2 or m < 2:
         none, dtype = jnp.zeros((), jnp.int32), jnp.result_type(points)
         match = GeometricMatch(
@@ -144,7 +150,8 @@ def points_of_map(
 
     Raises ValueError unless the landmarks are points.
     """
-    check_point_map("points_of_map", joint)
+    with refusals_of("points_of_map"):
+        check_point_map(joint)
     cov = cov_of_coordinates(joint, chart, square_root=square_root)
     return joint.landmarks, cov[3:, 3:], joint.alive
 
@@ -158,8 +165,9 @@ def lost(joint: Joint, chart: Chart, pose_cov: ArrayLike, *, square_root: bool =
     Raises ValueError on landmarks other than points, a linearizer with a memory, or a pose_cov
     that is no covariance.
     """
-    check_point_map("lost", joint)
-    check_covariance("lost: pose_cov", pose_cov, 3)
+    with refusals_of("lost"):
+        check_point_map(joint)
+        require("pose_cov", pose_cov, covariance(3))
     cov = cov_of_coordinates(joint, chart, square_root=square_root)
     cov = cov.at[:3].set(0.0).at[:, :3].set(0.0)
     cov = cov.at[:3, :3].set(jnp.asarray(pose_cov, cov.dtype))
@@ -189,13 +197,11 @@ def relocated(
     Raises:
         ValueError: as `lost`, or on shapes that do not fit.
     """
-    check_point_map("relocated", joint)
     m, capacity = np.shape(slot)[0], joint.landmarks.shape[0]
-    if np.shape(seen) != (m, 2) or np.shape(seen_covs) != (m, 2, 2):
-        raise ValueError(
-            f"relocated: expected scans of shape {(m, 2)} and {(m, 2, 2)}, "
-            f"got {np.shape(seen)} and {np.shape(seen_covs)}"
-        )
+    with refusals_of("relocated"):
+        check_point_map(joint)
+        require("seen", seen, array_of(m, 2))
+        require("seen_covs", seen_covs, array_of(m, 2, 2))
     cov = cov_of_coordinates(joint, chart, square_root=square_root)
     seen_cov = jnp.zeros((m, 2, m, 2), cov.dtype)
     seen_cov = seen_cov.at[jnp.arange(m), :, jnp.arange(m)].set(seen_covs)

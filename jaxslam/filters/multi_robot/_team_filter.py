@@ -8,14 +8,14 @@ import numpy as np
 
 from jaxslam.association._rules import Known
 from jaxslam.charts import Euclidean
-from jaxslam.core import _validation as validation
 from jaxslam.core._record import field, function_of, record, set_field, static
+from jaxslam.core._validation import check_models
 from jaxslam.core.protocols import Associate, Filter, Sensor
-from jaxslam.core.validation import at_least, one_of, or_none, probability
+from jaxslam.core.validation import InvalidField, at_least, one_of, or_none, probability
 from jaxslam.filters._ekf.correction import CorrectionOrder, Covariance
 from jaxslam.filters.multi_robot.team import Robot
 from jaxslam.math._arrays import Number
-from jaxslam.sensors._team import check_team, sizes
+from jaxslam.sensors._team import sizes, tags_of_robots, team_of_robots
 
 SIZE = 3
 """Numbers of a slot: x, y and the heading of a robot; of a landmark the third is padding."""
@@ -25,7 +25,7 @@ SIZE = 3
 class TeamFilter(Filter):
     """The robots and options of `TeamSlam`, and what follows from them."""
 
-    robots: tuple[Robot, ...]
+    robots: tuple[Robot, ...] = field(check=team_of_robots)
     """`team.Robot`s, in a list or tuple; robot 0 starts where the run does, the others relative to
     it"""
     capacity: int = static(check=at_least(1))
@@ -52,16 +52,15 @@ class TeamFilter(Filter):
     chart = Euclidean()
 
     def __post_init__(self) -> None:
-        name, robots = "TeamSlam", self.robots
-        tags = check_team(name, robots, self.tags, self.capacity)
-        set_field(self, "robots", tuple(robots))
+        robots = self.robots
+        tags = tags_of_robots(len(robots), self.tags, self.capacity)
         if self.tags is not None:
             set_field(self, "tags", tags)
         for robot in robots:
-            validation.check_models(name, robot.motion, robot.sensors)
+            check_models(robot.motion, robot.sensors)
         if type(self.report) is not int or not 0 <= self.report < len(robots):
-            raise ValueError(
-                f"{name}: expected report from 0 to {len(robots) - 1}, got {self.report!r}"
+            raise InvalidField(
+                "report", f"expected a number from 0 to {len(robots) - 1}, got {self.report!r}"
             )
         _check_sensors(robots)
         super().__post_init__()
@@ -111,19 +110,17 @@ class TeamFilter(Filter):
 
 
 def _check_sensors(robots: Sequence[Robot]) -> None:
-    """Raise ValueError unless landmarks are points, and unstarted robots can be initialized."""
+    """Raise InvalidField unless landmarks are points, and unstarted robots can be initialized."""
     for b, robot in enumerate(robots):
         for part in robot.sensors.parts:
             if part.sensor.landmark and not part.sensor.of_points:
-                raise ValueError(
-                    f"TeamSlam: expected landmarks (x, y), got {part.sensor.landmark} of "
-                    f"{part.sensor.name}"
-                )
+                got = f"{part.sensor.landmark} of {part.sensor.name}"
+                raise InvalidField(f"robots[{b}]", f"expected landmarks (x, y), got {got}")
         able = any(measures_points(part.sensor) for part in robot.sensors.parts)
         if b > 0 and robot.start is None and not able:
-            raise ValueError(
-                f"TeamSlam: robot {b} needs a start, or a sensor that measures both range and "
-                "bearing to find it by"
+            raise InvalidField(
+                f"robots[{b}]",
+                "expected a start, or a sensor that measures both range and bearing to find it by",
             )
 
 

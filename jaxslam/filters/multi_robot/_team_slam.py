@@ -11,6 +11,7 @@ from jaxslam.core import slots
 from jaxslam.core._record import record
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate, Info, Scan, Status
+from jaxslam.core.validation import InvalidField
 from jaxslam.filters._ekf.ekf_slam import EkfSlam, update_by_sensor
 from jaxslam.filters._reporting import join_infos
 from jaxslam.filters.multi_robot._pose_initialization import best_initialization, observed_points
@@ -87,9 +88,10 @@ class TeamSlam(TeamFilter):
     def update(self, state: Joint, scan: Scan, key: Array) -> tuple[Joint, Info]:
         _, place_ends, size_z = sizes(self.robots)
         if scan.tag.shape[0] != place_ends[-1]:
-            raise ValueError(
-                f"TeamSlam: expected {place_ends[-1]} measurement slots in a scan, got "
-                f"{scan.tag.shape[0]}"
+            raise InvalidField(
+                "",
+                f"expected {place_ends[-1]} measurement slots in a scan, got {scan.tag.shape[0]}",
+                owner="TeamSlam",
             )
         scans = split_scan(scan, self.places_by_robot)
         infos: dict[int, Info] = {}

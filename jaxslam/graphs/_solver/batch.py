@@ -14,6 +14,7 @@ from jaxtyping import Int, PyTree
 
 from jaxslam.core._numbers import is_concrete
 from jaxslam.core.types import JaxOrNumPy
+from jaxslam.core.validation import InvalidField
 from jaxslam.graphs._graph import Graph, Table
 from jaxslam.graphs._sparse.sweeps import padded_size
 from jaxslam.math._arrays import in_dtype
@@ -99,13 +100,13 @@ def with_batch(tree: _T) -> _T:
     return cast(_T, jax.tree.map(lambda x: jnp.asarray(x)[..., None], tree))
 
 
-def over_batch(name: str, function: Callable[..., _T]) -> Callable[[PyTree, PyTree], _T]:
+def over_batch(function: Callable[..., _T]) -> Callable[[PyTree, PyTree], _T]:
     """The function of one graph, called with (shared, graph), from a function of graphs with a last
     axis B.
 
     `function(*shared, graphs)` computes all graphs at once, so that its loops run over tables that
-    the graphs share. Under `vmap`, nested or not, the batch becomes larger. Raises ValueError,
-    which begins with a caller's name, if a shared argument has a batch axis.
+    the graphs share. Under `vmap`, nested or not, the batch becomes larger. Raises InvalidField if
+    a shared argument has a batch axis.
     """
 
     @jax.custom_batching.custom_vmap
@@ -115,9 +116,8 @@ def over_batch(name: str, function: Callable[..., _T]) -> Callable[[PyTree, PyTr
     @batched_call.def_vmap
     def rule(size: int, batched: PyTree, shared: PyTree, graphs: PyTree) -> tuple[_T, PyTree]:
         if any(jax.tree.leaves(batched[0])):
-            raise ValueError(
-                f"{name}: expected the same factors, kernels, plan and limits for all graphs "
-                "of a batch"
+            raise InvalidField(
+                "graphs", "expected the same factors, kernels, plan and limits for all of a batch"
             )
 
         if size > _GROUP:

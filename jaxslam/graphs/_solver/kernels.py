@@ -3,9 +3,9 @@
 import jax
 import jax.numpy as jnp
 
-from jaxslam.core._numbers import check_positive
-from jaxslam.core._record import record
+from jaxslam.core._record import check_field, record
 from jaxslam.core.protocols import Component
+from jaxslam.core.validation import positive
 from jaxslam.math._arrays import Number
 
 Array = jax.Array
@@ -36,7 +36,7 @@ class _OfWidth(Kernel):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_positive(type(self).__name__, width=self.width)
+        check_field(self, "width", positive)
 
     def _widths(self, s: Array) -> tuple[Array, Array]:
         """The width and its square, in the dtype of s."""

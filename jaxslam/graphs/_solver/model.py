@@ -9,6 +9,8 @@ import numpy as np
 from jaxtyping import PyTree
 
 from jaxslam.core._record import record
+from jaxslam.core._reprs import describe
+from jaxslam.core.validation import InvalidField, instance_of, require
 from jaxslam.graphs._factor import REGISTRY, Factor
 from jaxslam.graphs._graph import Graph
 from jaxslam.graphs._solver.kernels import Kernel
@@ -30,50 +32,44 @@ class Model:
 
 
 def model_of(
-    name: str,
     graph: Graph,
     factors: Mapping[str, Factor] | None,
     kernel: Kernel | Mapping[str, Kernel] | None = None,
 ) -> Model:
-    """The model of a graph's tables. Raises ValueError, which begins with a caller's name."""
-    by_table = factors_of(name, graph, factors)
+    """The model of a graph's tables. Raises InvalidField as `factors_of`, and on the kernels."""
+    by_table = factors_of(graph, factors)
     if kernel is not None and not isinstance(kernel, Mapping):
         kernel = dict.fromkeys(graph.tables, kernel)
     for value in (kernel or {}).values():
-        _check_instance(name, value, Kernel, "graphs.Huber()")
+        require("kernel", value, instance_of(Kernel, "; graphs.Huber() is one"))
     if lost := sorted(set(kernel or ()) - set(graph.tables)):
-        raise ValueError(
-            f"{name}: kernels of tables that are not in the graph: {', '.join(lost)}; "
-            f"there are: {', '.join(graph.tables)}"
+        raise InvalidField(
+            "kernel",
+            f"of tables that are not in the graph: {', '.join(lost)}; there are: "
+            f"{', '.join(graph.tables)}",
         )
     return Model(by_table, dict(kernel or {}))
 
 
-def factors_of(name: str, graph: Graph, factors: Mapping[str, Factor] | None) -> dict[str, Factor]:
+def factors_of(graph: Graph, factors: Mapping[str, Factor] | None) -> dict[str, Factor]:
     """The factor of each table, by its name or by the part of the name before a slash.
 
     The tables are in the order of their names, as in a graph that has been through `jax.tree.map`.
-    By default the factors are `REGISTRY`. Raises ValueError, which begins with a caller's name,
-    also on a factor whose residual has another shape than its `errors` tell.
+    By default the factors are `REGISTRY`. Raises InvalidField, also on a factor whose residual has
+    another shape than its `errors` tell.
     """
-    if not isinstance(graph, Graph):
-        got = repr(graph) if isinstance(graph, str) else f"a {type(graph).__name__}"
-        raise ValueError(
-            f"{name}: expected a Graph, as datasets.read_graph(path) or the graph of a solution, "
-            f"got {got}"
-        )
+    require("graph", graph, instance_of(Graph, "; datasets.read_graph(path) returns one"))
     by_name = REGISTRY if factors is None else factors
     if not isinstance(by_name, Mapping):
-        got = type(by_name).__name__
-        raise ValueError(f"{name}: expected factors as a dict by table, got a {got}")
+        raise InvalidField("factors", f"expected a dict by table, got {describe(by_name)}")
     for value in by_name.values():
-        _check_instance(name, value, Factor, "graphs.RelativePose()")
+        require("factors", value, instance_of(Factor, "; graphs.RelativePose() is one"))
     by_table = {}
     for key in sorted(graph.tables):
         factor = by_name.get(key, by_name.get(key.split("/")[0]))
         if factor is None:
-            raise ValueError(
-                f"{name}: table {key!r} has no factor; there are: {', '.join(by_name) or 'none'}"
+            raise InvalidField(
+                "factors", f"table {key!r} has no factor; there are: {', '.join(by_name) or 'none'}"
             )
         sizes, number = {"pose": 3, "point": np.shape(graph.points)[-1]}, jnp.result_type(float)
         involved = tuple(jax.ShapeDtypeStruct((sizes[kind],), number) for kind in factor.variables)
@@ -81,22 +77,16 @@ def factors_of(name: str, graph: Graph, factors: Mapping[str, Factor] | None) ->
         residual = jax.eval_shape(_residual, factor, involved, z)
         got = getattr(residual, "shape", type(residual).__name__)
         if got != (len(factor.errors),):
-            raise ValueError(
-                f"{name}: the factor {factor.name!r} of table {key!r}: expected a residual of "
+            raise InvalidField(
+                "factors",
+                f"the factor {factor.name!r} of table {key!r}: expected a residual of "
                 f"shape ({len(factor.errors)},), as its errors tell "
-                f"({', '.join(factor.errors)}), got {got}"
+                f"({', '.join(factor.errors)}), got {got}",
             )
         by_table[key] = factor
     if not by_table:
-        raise ValueError(f"{name}: the graph has no tables")
+        raise InvalidField("graph", "it has no tables")
     return by_table
-
-
-def _check_instance(name: str, value: object, kind: type, example: str) -> None:
-    """Raise ValueError unless a value is an instance of a class; on the class itself, too."""
-    if not isinstance(value, kind):
-        got = f"the class {value.__name__}" if isinstance(value, type) else repr(value)
-        raise ValueError(f"{name}: expected a {kind.__name__}, as {example}, got {got}")
 
 
 @partial(jax.jit, inline=True)

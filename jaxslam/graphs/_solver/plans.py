@@ -8,6 +8,7 @@ from jaxtyping import Array, Bool, Int
 from numpy.typing import ArrayLike
 
 from jaxslam.core._numbers import is_concrete
+from jaxslam.core.validation import InvalidField, refusals_of
 from jaxslam.graphs._factor import Factor
 from jaxslam.graphs._graph import Graph
 from jaxslam.graphs._solver.model import factors_of
@@ -78,29 +79,35 @@ def plan(
     Raises:
         ValueError: where `who` is traced, or the tables do not fit their factors.
     """
-    factors = factors_of("graphs.plan", graph, factors)
-    poses, points = len(graph.poses), len(graph.points)
-    size = poses + points
     who, rows = {}, []
-    for name in factors:
-        table = graph.tables[name]
-        if not is_concrete(table.who):
-            raise ValueError(
-                f"graphs.plan: `who` of the table {name!r} is traced: make the plan of one graph "
-                "outside, and give it as `plan`"
+    with refusals_of("graphs.plan"):
+        factors = factors_of(graph, factors)
+        poses, points = len(graph.poses), len(graph.points)
+        size = poses + points
+        wanted = checked_pairs(pairs, size)
+        for name in factors:
+            table = graph.tables[name]
+            if not is_concrete(table.who):
+                raise InvalidField(
+                    "",
+                    f"`who` of the table {name!r} is traced: make the plan of one graph "
+                    "outside, and give it as `plan`",
+                )
+            who[name] = np.asarray(table.who, np.int32)
+            count = np.array(
+                [poses if kind == "pose" else points for kind in factors[name].variables]
             )
-        who[name] = np.asarray(table.who, np.int32)
-        count = np.array([poses if kind == "pose" else points for kind in factors[name].variables])
-        lost = ((who[name] < 0) | (who[name] >= count)).any(axis=1)
-        bad = lost & np.asarray(table.valid) if is_concrete(table.valid) else lost
-        if bad.any():
-            raise ValueError(
-                f"graphs.plan: row {bad.argmax()} of the table {name!r} has a variable out of "
-                f"range: {np.asarray(table.who)[bad.argmax()].tolist()}"
-            )
-        who[name] = np.where(lost[:, None], 0, who[name])
-        shift = np.array([poses * (kind == "point") for kind in factors[name].variables])
-        rows.append((who[name] + shift, lost))
+            lost = ((who[name] < 0) | (who[name] >= count)).any(axis=1)
+            bad = lost & np.asarray(table.valid) if is_concrete(table.valid) else lost
+            if bad.any():
+                raise InvalidField(
+                    "",
+                    f"row {bad.argmax()} of the table {name!r} has a variable out of "
+                    f"range: {np.asarray(table.who)[bad.argmax()].tolist()}",
+                )
+            who[name] = np.where(lost[:, None], 0, who[name])
+            shift = np.array([poses * (kind == "point") for kind in factors[name].variables])
+            rows.append((who[name] + shift, lost))
     # Each two variables of a row have a block, and so have the pairs of `marginals`.
     joined = [
         np.stack([variables[~lost, k], variables[~lost, j]])
@@ -108,7 +115,6 @@ def plan(
         for k in range(variables.shape[1])
         for j in range(k)
     ]
-    wanted = checked_pairs("graphs.plan", pairs, size)
     first, second = np.concatenate([wanted.T, *joined], axis=1)
     pattern = factor_pattern(size, first, second)
     cholesky, place = cholesky_tables(pattern, room)
@@ -143,27 +149,24 @@ def plan(
     )
 
 
-def checked_pairs(name: str, pairs: ArrayLike, size: int) -> Int[np.ndarray, "Q 2"]:
-    """Pairs of variables, (Q, 2); raises ValueError, which begins with a caller's name, on another
-    shape, on numbers that are not whole, and on one out of range."""
+def checked_pairs(pairs: ArrayLike, size: int) -> Int[np.ndarray, "Q 2"]:
+    """Pairs of variables, (Q, 2); raises InvalidField on another shape, on numbers that are not
+    whole, and on one out of range."""
     numbers = np.asarray(pairs)
     if numbers.size == 0:
         return np.zeros((0, 2), int)
     if numbers.ndim != 2 or numbers.shape[1] != 2 or not np.issubdtype(numbers.dtype, np.integer):
-        raise ValueError(
-            f"{name}: expected pairs of whole numbers, (Q, 2), got {numbers.dtype} of shape "
-            f"{numbers.shape}"
-        )
+        got = f"{numbers.dtype} of shape {numbers.shape}"
+        raise InvalidField("pairs", f"expected whole numbers, (Q, 2), got {got}")
     wanted = numbers.astype(int)
     if ((wanted < 0) | (wanted >= size)).any():
-        raise ValueError(
-            f"{name}: expected pairs of variables from 0 to {size - 1}, got {wanted.tolist()}"
+        raise InvalidField(
+            "pairs", f"expected variables from 0 to {size - 1}, got {wanted.tolist()}"
         )
     return wanted
 
 
 def plan_for(
-    name: str,
     graph: Graph,
     factors: Mapping[str, Factor],
     existing: Plan | None,
@@ -183,13 +186,13 @@ def plan_for(
         if same and is_concrete(graph.tables[key].who) and is_concrete(who):
             same = bool(np.array_equal(graph.tables[key].who, who))
     if not same:
-        raise ValueError(f"{name}: the plan is of another graph: variables or `who` differ")
+        raise InvalidField("plan", "it is of another graph: variables or `who` differ")
     if marginals and existing.inverse is None:
-        raise ValueError(f"{name}: the plan is without marginals: `plan(graph, marginals=True)`")
+        raise InvalidField("plan", "it is without marginals: `plan(graph, marginals=True)`")
     if (
         pairs is not None
         and len(pairs)
         and not (is_concrete(existing.pairs) and np.array_equal(existing.pairs, pairs))
     ):
-        raise ValueError(f"{name}: the plan is of other pairs: `plan(graph, pairs=…)`")
+        raise InvalidField("plan", "it is of other pairs: `plan(graph, pairs=…)`")
     return existing

@@ -1,18 +1,17 @@
 """The maximum a posteriori (MAP) path and landmarks of a log, a reference for accuracy."""
 
 import dataclasses
-import math
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxslam.core._numbers import check_count
 from jaxslam.core._record import record, static
 from jaxslam.core.protocols import Sensor
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate, Log, Trace
+from jaxslam.core.validation import InvalidField, at_least, or_none, positive
 from jaxslam.graphs._chain.problem import Iterate, Iterations, Problem, optimize_chain
 from jaxslam.graphs._solver.search import Ending
 from jaxslam.graphs.smoothing._forward_pass import ForwardPass, LogEstimator, log_in_one_dtype
@@ -86,24 +85,22 @@ class BatchMap(LogEstimator):
     """
 
     _: dataclasses.KW_ONLY
-    iterations: int = static(default=30)
+    iterations: int = static(default=30, check=at_least(1))
     """largest number of steps"""
-    tolerance: float | None = static(default=1e-6)
+    tolerance: float | None = static(default=1e-6, check=or_none(positive))
     """end when the next step is below this many posterior standard deviations (the Newton
     decrement), or than √eps of the dtype, 3e-4 in float32, or where steps do not get shorter
     because of rounding. None runs all iterations in a loop of fixed length, which supports
     reverse-mode derivatives; they are those of the optimum if the search has converged"""
 
     def __post_init__(self) -> None:
-        check_count("BatchMap: iterations", self.iterations)
-        if self.tolerance is not None and not 0 < self.tolerance < math.inf:
-            raise ValueError(f"BatchMap: expected a tolerance above 0, got {self.tolerance}")
         super().__post_init__()
         free = self.sensor.free.mean.shape[0]
         if free > 0:
-            raise ValueError(
-                "BatchMap: expected a sensor that measures all of a landmark, got "
-                f"{self.sensor.name}, which leaves {free} of its parameters free"
+            raise InvalidField(
+                "sensor",
+                f"expected one that measures all of a landmark, got {self.sensor.name}, which "
+                f"leaves {free} of its parameters free",
             )
 
     def solve(self, log: Log, key: Array) -> Trace:

@@ -14,7 +14,7 @@ from jaxslam.core._validation import motion_model, sensor_model
 from jaxslam.core.protocols import Associate, Filter, Motion, Sensor
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate, Info, Scan, Status
-from jaxslam.core.validation import at_least, or_none, probability
+from jaxslam.core.validation import InvalidField, at_least, or_none, probability
 from jaxslam.filters._ekf.ekf_slam import EkfSlam
 from jaxslam.graphs._chain.window import (
     WindowIterate,
@@ -97,18 +97,18 @@ class FixedLag(Filter):
     chart = Euclidean()
 
     def __post_init__(self) -> None:
-        name, sensor = type(self).__name__, self.sensor
+        sensor = self.sensor
         same = len(sensor.measurements) == len(sensor.landmark)
         several = isinstance(sensor, Suite) or sensor.reduced is not None
         if several or sensor.free.mean.shape[0] or not same:
-            raise ValueError(
-                f"{name}: expected one sensor whose measurement determines its landmark by as many "
-                f"numbers as it has, got {sensor.name}"
+            raise InvalidField(
+                "sensor",
+                "expected one whose measurement determines its landmark by as many numbers as it "
+                f"has, got {sensor.name}",
             )
         if self.first_estimates and sensor.landmark != _POINT:
-            raise ValueError(
-                f"{name}: expected landmarks (x, y) for first_estimates, got {sensor.landmark}"
-            )
+            reason = f"expected landmarks (x, y) for first_estimates, got {sensor.landmark}"
+            raise InvalidField("sensor", reason)
         super().__post_init__()
 
     @property
@@ -133,10 +133,8 @@ class FixedLag(Filter):
     def update(self, state: _WindowState, scan: Scan, key: Array) -> tuple[_WindowState, Info]:
         motion, sensor = self.motion, self.sensor
         if scan.z.shape[0] > self.slots:
-            raise ValueError(
-                f"FixedLag: expected scans of at most {self.slots} measurement slots, as `slots` "
-                f"says, got {scan.z.shape[0]}"
-            )
+            reason = f"expected at least {scan.z.shape[0]}, as a scan has, got {self.slots}"
+            raise InvalidField("slots", reason, owner="FixedLag")
         # The window weights by R⁻¹.
         regular = jax.vmap(lambda z: linalg.cholesky(sensor.noise_cov(z))[1])(scan.z)
         lost = scan.valid & ~regular

@@ -16,7 +16,7 @@ from jaxslam.core._validation import motion_model, sensor_model
 from jaxslam.core.protocols import Associate, Component, Filter, Motion, Sensor, Wrapper
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate, Info, Log, Scan, Trace
-from jaxslam.core.validation import at_least, or_none, probability
+from jaxslam.core.validation import InvalidField, at_least, or_none, probability, refusals_of
 from jaxslam.filters._ekf.ekf_slam import EkfSlam
 from jaxslam.math._arrays import Number
 from jaxslam.math._xla import hot_jit
@@ -112,16 +112,18 @@ class LogEstimator(Component):
     """See `EkfSlam.births`."""
 
     def __post_init__(self) -> None:
-        name, sensor = type(self).__name__, self.sensor
+        sensor = self.sensor
         if isinstance(sensor, Suite) or sensor.reduced is not None:
-            raise ValueError(
-                f"{name}: expected one sensor of landmarks, not a suite or landmarks that are "
-                f"converted to points, got {sensor.name}"
+            raise InvalidField(
+                "sensor",
+                "expected one of landmarks, not a suite or landmarks that are converted to points, "
+                f"got {sensor.name}",
             )
         if len(sensor.landmark) > len(sensor.measurements) + sensor.free.mean.shape[0]:
-            raise ValueError(
-                f"{name}: expected landmarks that measurement and prior determine, got "
-                f"{sensor.landmark} of {sensor.name}"
+            raise InvalidField(
+                "sensor",
+                "expected landmarks that measurement and prior determine, got "
+                f"{sensor.landmark} of {sensor.name}",
             )
         for start in ("pose", "pose_cov"):
             set_field(self, start, held_array(getattr(self, start)))
@@ -132,7 +134,8 @@ class LogEstimator(Component):
         raise NotImplementedError
 
     def __call__(self, log: Log, key: Array) -> Trace:
-        check_run(self.name, self._filter, log, self.pose, self.pose_cov)
+        with refusals_of(self.name):
+            check_run(self._filter, log, self.pose, self.pose_cov)
         return _solve(self, log, key)
 
     @property

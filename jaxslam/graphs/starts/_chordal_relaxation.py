@@ -4,6 +4,7 @@ import numpy as np
 import scipy  # its parts load where they are used
 from jaxtyping import Bool, Float
 
+from jaxslam.core.validation import refusals_of
 from jaxslam.graphs._graph import Graph, Table
 from jaxslam.graphs.starts._relative import (
     Factors,
@@ -32,8 +33,9 @@ def chordal(graph: Graph, factors: Factors | None = None) -> Graph:
 
     Arguments, points that no relative position places, and errors are those of `odometry`.
     """
-    relative = measured_relative_poses(graph, factors)
-    anchors, poses = anchors_of("chordal", graph, relative)
+    with refusals_of("chordal"):
+        relative = measured_relative_poses(graph, factors)
+        anchors, poses = anchors_of(graph, relative)
     poses[:, 2] = _headings(relative, anchors, poses[:, 2])
     placed = np.zeros(len(graph.points), bool)
     if (table := graph.tables.get("relative_position")) is not None:

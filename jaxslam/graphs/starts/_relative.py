@@ -11,6 +11,7 @@ import scipy  # its parts load where they are used
 from jaxtyping import Bool, Float, Int
 
 from jaxslam.core.types import JaxOrNumPy
+from jaxslam.core.validation import InvalidField
 from jaxslam.graphs._factor import BetweenPoses, Factor
 from jaxslam.graphs._graph import Graph, ranks
 from jaxslam.graphs._solver.model import factors_of
@@ -35,7 +36,7 @@ def measured_relative_poses(graph: Graph, factors: Factors | None) -> Relative:
 
     A row of zero information measures none.
     """
-    parts, by_table = [], factors_of("graphs.starts", graph, factors)
+    parts, by_table = [], factors_of(graph, factors)
     for key, table in graph.tables.items():
         factor = by_table[key]
         if factor.variables != ("pose", "pose") or factor.predict is None:
@@ -87,12 +88,12 @@ def _measured_poses(factor: Factor, z: jax.Array) -> tuple[jax.Array, jax.Array]
 
 
 def anchors_of(
-    name: str, graph: Graph, relative: Relative
+    graph: Graph, relative: Relative
 ) -> tuple[Bool[np.ndarray, "N"], Float[np.ndarray, "N 3"]]:
     """Whether each pose is an anchor, which holds its part of the graph, and all poses, with the
     anchors where they are held.
 
-    Raises ValueError, which begins with the name of the start, if a part has no anchor.
+    Raises InvalidField if a part has no anchor.
     """
     poses = np.array(graph.poses, np.float64)
     anchors = np.asarray(graph.fixed_pose).copy()
@@ -114,10 +115,10 @@ def anchors_of(
         anchors[lowest] = held[part[lowest]] = True
     if not held.all():
         lost = int(np.flatnonzero(~held[part])[0])
-        raise ValueError(
-            f"{name}: pose {int(graph.pose_id[lost])} is not connected to a fixed pose by relative "
-            "poses"
+        reason = (
+            f"pose {int(graph.pose_id[lost])} is not connected to a fixed pose by relative poses"
         )
+        raise InvalidField("graph", reason)
     return anchors, poses
 
 
@@ -145,7 +146,7 @@ def with_points(
     places them.
     """
     points = np.array(graph.points, np.float64)
-    by_table = factors_of("graphs.starts", graph, factors)
+    by_table = factors_of(graph, factors)
     placed_already = np.asarray(graph.fixed_point) | (False if placed is None else placed)
     for key, table in graph.tables.items():
         factor = by_table[key]

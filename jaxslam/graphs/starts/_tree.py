@@ -8,6 +8,7 @@ import math
 import numpy as np
 import scipy  # its parts load where they are used
 
+from jaxslam.core.validation import refusals_of
 from jaxslam.graphs._graph import TRUSTED, Graph, ranks, with_loops_apart
 from jaxslam.graphs._optimizer import optimize
 from jaxslam.graphs._solver.kernels import DynamicCovarianceScaling
@@ -35,8 +36,9 @@ def odometry(graph: Graph, factors: Factors | None = None) -> Graph:
     Raises:
         ValueError: if some pose is not connected to an anchor by relative poses.
     """
-    relative = measured_relative_poses(graph, factors)
-    return with_points(_along_a_tree("odometry", graph, relative, nearest=True), factors)
+    with refusals_of("odometry"):
+        relative = measured_relative_poses(graph, factors)
+        return with_points(_along_a_tree(graph, relative, nearest=True), factors)
 
 
 def spanning_tree(graph: Graph, factors: Factors | None = None) -> Graph:
@@ -44,16 +46,17 @@ def spanning_tree(graph: Graph, factors: Factors | None = None) -> Graph:
 
     Arguments, points and errors are those of `odometry`.
     """
-    relative = measured_relative_poses(graph, factors)
-    return with_points(_along_a_tree("spanning_tree", graph, relative, nearest=False), factors)
+    with refusals_of("spanning_tree"):
+        relative = measured_relative_poses(graph, factors)
+        return with_points(_along_a_tree(graph, relative, nearest=False), factors)
 
 
-def _along_a_tree(name: str, graph: Graph, relative: Relative, nearest: bool) -> Graph:
+def _along_a_tree(graph: Graph, relative: Relative, nearest: bool) -> Graph:
     """The graph with poses composed along a tree from the anchors.
 
     nearest: whether the tree has the least sum of |i - j|; otherwise the fewest edges to each pose.
     """
-    anchors, poses = anchors_of(name, graph, relative)
+    anchors, poses = anchors_of(graph, relative)
     # Nodes are counted in the order of the ids, which decides between trees of equal cost.
     rank = ranks(graph)
     count, first, second = len(poses), rank[relative.first], rank[relative.second]

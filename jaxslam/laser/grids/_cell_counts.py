@@ -10,9 +10,18 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, PyTree
 
-from jaxslam.core._numbers import check_mount, check_positive, is_concrete
+from jaxslam.core._numbers import is_concrete
 from jaxslam.core.types import Beams, JaxOrNumPy
-from jaxslam.laser.grids._grid import Grid, check_frame, to_cells
+from jaxslam.core.validation import (
+    InvalidField,
+    finite,
+    instance_of,
+    mounting_pose,
+    positive,
+    refusals_of,
+    require,
+)
+from jaxslam.laser.grids._grid import Grid, to_cells
 from jaxslam.laser.grids.beam_models._beam_model import usable_beams
 from jaxslam.math import se2
 from jaxslam.math._arrays import Number
@@ -66,33 +75,37 @@ def count(
             usable beam, or a usable pose that is not finite.
     """
     if np.shape(shape) != (2,) or not all(isinstance(n, Integral) and n >= 1 for n in shape):
-        raise ValueError(
-            f"count: expected a shape (H, W), integers, of at least one cell, got {shape!r}"
-        )
-    check_frame("count", origin, resolution)
-    check_mount("count", mount)
-    if not isinstance(beams, Beams):
-        raise ValueError(f"count: expected Beams, got {type(beams).__name__}")
-    if not all(hasattr(part, "dtype") for part in beams):
-        kinds = ", ".join(type(part).__name__ for part in beams)
-        raise ValueError(f"count: expected ranges, angles and masks in arrays, got {kinds}")
-    shapes = [np.shape(part) for part in beams]
-    if len(set(shapes)) != 1 or len(shapes[0]) != 2:
-        raise ValueError(f"count: expected as many ranges, angles and masks (T, B), got {shapes}")
-    if np.shape(poses) != (shapes[0][0], 3):
-        raise ValueError(
-            f"count: expected a pose (x, y, θ) for each of {shapes[0][0]} scans, got "
-            f"{np.shape(poses)}"
-        )
-    check_positive("count", max_range=max_range)
-    if is_concrete(beams, poses):
-        if not np.all(np.isfinite(poses)):
-            raise ValueError("count: expected finite poses")
-        if not np.any(usable_beams(Beams(*map(np.asarray, beams)))):
-            raise ValueError("count: no scan has a valid beam")
-    free = max_range if no_return is None else no_return
-    if not 0 <= free <= max_range:
-        raise ValueError(f"count: expected no_return from 0 to {max_range}, got {no_return}")
+        reason = f"expected (H, W), integers, of at least one cell, got {shape!r}"
+        raise InvalidField("shape", reason, owner="count")
+    with refusals_of("count"):
+        require("origin", origin, finite(3))
+        require("resolution", resolution, positive)
+        require("mount", mount, mounting_pose)
+        require("beams", beams, instance_of(Beams))
+        if not all(hasattr(part, "dtype") for part in beams):
+            kinds = ", ".join(type(part).__name__ for part in beams)
+            raise InvalidField("beams", f"expected ranges, angles and masks in arrays, got {kinds}")
+        shapes = [np.shape(part) for part in beams]
+        if len(set(shapes)) != 1 or len(shapes[0]) != 2:
+            raise InvalidField(
+                "beams", f"expected as many ranges, angles and masks (T, B), got {shapes}"
+            )
+        if np.shape(poses) != (shapes[0][0], 3):
+            raise InvalidField(
+                "poses",
+                f"expected one (x, y, θ) for each of {shapes[0][0]} scans, got {np.shape(poses)}",
+            )
+        require("max_range", max_range, positive)
+        if is_concrete(beams, poses):
+            if not np.all(np.isfinite(poses)):
+                raise InvalidField("poses", "expected finite numbers")
+            if not np.any(usable_beams(Beams(*map(np.asarray, beams)))):
+                raise InvalidField("beams", "no scan has a valid beam")
+        free = max_range if no_return is None else no_return
+        if not 0 <= free <= max_range:
+            raise InvalidField(
+                "no_return", f"expected a number from 0 to {max_range}, got {no_return}"
+            )
     frame = jnp.asarray(origin, float), jnp.asarray(resolution, float)
     eye = jnp.asarray(mount, float)
     size = int(shape[0]), int(shape[1])
@@ -199,7 +212,9 @@ def occupancy(counts: Counts, *, hit: Number = 0.7, miss: ArrayLike = 0.4) -> Gr
         is_concrete(hit, miss)
         and not 0 < float(np.asarray(miss)) < 0.5 < float(np.asarray(hit)) < 1
     ):
-        raise ValueError(f"occupancy: expected 0 < miss < 0.5 < hit < 1, got {miss!r} and {hit!r}")
+        raise InvalidField(
+            "", f"expected 0 < miss < 0.5 < hit < 1, got {miss!r} and {hit!r}", owner="occupancy"
+        )
     log_hit = jnp.log(hit) - jnp.log1p(-jnp.asarray(hit))
     log_miss = jnp.log(miss) - jnp.log1p(-jnp.asarray(miss))
     log_odds = counts.hits * log_hit + counts.misses * log_miss
@@ -215,7 +230,7 @@ def reflection(counts: Counts, *, prior: ArrayLike = 1.0) -> Grid:
     Raises ValueError unless prior is above 0.
     """
     if is_concrete(prior) and not float(np.asarray(prior)) > 0:
-        raise ValueError(f"reflection: expected a prior above 0, got {prior!r}")
+        raise InvalidField("prior", f"expected a number above 0, got {prior!r}", owner="reflection")
     log_odds = jnp.log(counts.hits + prior) - jnp.log(counts.misses + prior)
     return Grid(log_odds, counts.origin, counts.resolution)
 

@@ -4,12 +4,17 @@ import functools
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from jaxslam.core._numbers import check_real, is_concrete
 from jaxslam.core.types import JaxOrNumPy
-from jaxslam.laser.grids._grid import Field, Grid, check_grid
+from jaxslam.core.validation import (
+    finite,
+    or_none,
+    positive,
+    refusals_of,
+    require,
+)
+from jaxslam.laser.grids._grid import Field, Grid, grid_map
 from jaxslam.math._arrays import Number
 
 
@@ -26,12 +31,10 @@ def distance_field(grid: Grid, *, threshold: Number = 0.0, truncate: Number | No
     Raises:
         ValueError: a grid that is none, a threshold that is not finite, or truncate not above 0.
     """
-    check_grid("distance_field", grid)
-    check_real("distance_field", threshold=threshold)
-    if is_concrete(threshold) and not np.isfinite(threshold):
-        raise ValueError(f"distance_field: expected a finite threshold, got {threshold}")
-    if truncate is not None and is_concrete(truncate) and not truncate > 0:
-        raise ValueError(f"distance_field: expected truncate above 0, got {truncate}")
+    with refusals_of("distance_field"):
+        require("grid", grid, grid_map)
+        require("threshold", threshold, finite())
+        require("truncate", truncate, or_none(positive))
     largest = jnp.inf if truncate is None else truncate
     field: Field = _distance_field(grid, threshold, largest)
     return field

@@ -1,6 +1,6 @@
 """The data of a grid map and of a field over one: coordinates, interpolation."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -8,9 +8,18 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from jaxslam.core._numbers import check_real, is_concrete, shape_text
+from jaxslam.core._numbers import is_concrete
 from jaxslam.core._reprs import short_repr
 from jaxslam.core.types import JaxOrNumPy
+from jaxslam.core.validation import (
+    InvalidField,
+    array_of,
+    finite,
+    instance_of,
+    positive,
+    refusals_of,
+    require,
+)
 from jaxslam.math import se2
 
 
@@ -69,42 +78,21 @@ def centers(grid: Grid | Field) -> Float[Array, "H W 2"]:
     return jnp.einsum("ab,hwb->hwa", se2.rotation(origin[2]), local) + origin[None, None, :2]
 
 
-def check_grid(name: str, grid: object) -> None:
-    """Raise ValueError, which begins with a caller's name, unless the grid is one.
+def grid_map(value: Any) -> Grid:
+    """The check of a grid; within a trace only shapes are checked.
 
     Refused are log-odds other than a finite array of floats of at least one cell, an origin that is
-    no pose, and a resolution that is not above 0. Within a trace only shapes are checked.
+    no pose, and a resolution that is not above 0.
     """
-    if not isinstance(grid, Grid):
-        raise ValueError(f"{name}: expected a Grid, got {type(grid).__name__}")
-    if not hasattr(grid.log_odds, "dtype") or not jnp.issubdtype(grid.log_odds.dtype, np.floating):
-        kind = getattr(grid.log_odds, "dtype", f"a {type(grid.log_odds).__name__}")
-        raise ValueError(f"{name}: expected log-odds in an array of floats, got {kind}")
-    if np.ndim(grid.log_odds) != 2 or 0 in np.shape(grid.log_odds):
-        raise ValueError(
-            f"{name}: expected log-odds of shape (at least 1, at least 1), "
-            f"got {shape_text(grid.log_odds)}"
-        )
-    check_frame(name, grid.origin, grid.resolution)
+    grid: Grid = instance_of(Grid)(value)
+    require("log_odds", grid.log_odds, array_of("H", "W", kind=np.floating))
+    if 0 in (shape := np.shape(grid.log_odds)):
+        raise InvalidField("log_odds", f"expected at least one cell, got shape {shape}")
+    require("origin", grid.origin, finite(3))
+    require("resolution", grid.resolution, positive)
     if is_concrete(grid.log_odds) and not np.all(np.isfinite(grid.log_odds)):
-        raise ValueError(f"{name}: expected finite log-odds; unknown is 0")
-
-
-def check_frame(name: str, origin: ArrayLike, resolution: ArrayLike) -> None:
-    """Raise ValueError unless origin is a pose, and resolution a finite number above 0."""
-    check_real(name, origin=origin, resolution=resolution)
-    if np.shape(origin) != (3,):
-        raise ValueError(
-            f"{name}: expected an origin that is a pose (x, y, θ), got {shape_text(origin)}"
-        )
-    if np.shape(resolution) != ():
-        raise ValueError(f"{name}: expected one resolution, got {shape_text(resolution)}")
-    if not is_concrete(origin, resolution):
-        return
-    if not np.all(np.isfinite(origin)):
-        raise ValueError(f"{name}: expected a finite origin, got {np.asarray(origin)}")
-    if not 0 < float(np.asarray(resolution)) < np.inf:
-        raise ValueError(f"{name}: expected a resolution above 0, got {resolution}")
+        raise InvalidField("log_odds", "expected finite numbers; unknown is 0")
+    return grid
 
 
 def interpolate(field: Field, points: ArrayLike) -> Float[Array, "*n"]:
@@ -116,11 +104,11 @@ def interpolate(field: Field, points: ArrayLike) -> Float[Array, "*n"]:
 
     Raises ValueError on other types than fields, and on points of a shape other than (..., 2).
     """
-    if not isinstance(field, Field):
-        raise ValueError(f"interpolate: expected a Field, got a {type(field).__name__}")
-    points = jnp.asarray(points)
-    if points.ndim == 0 or points.shape[-1] != 2:
-        raise ValueError(f"interpolate: expected points (x, y), got shape {points.shape}")
+    with refusals_of("interpolate"):
+        require("field", field, instance_of(Field))
+        points = jnp.asarray(points)
+        if points.ndim == 0 or points.shape[-1] != 2:
+            raise InvalidField("points", f"expected (x, y), got shape {points.shape}")
     # Half a cell: entry (i, j) is the value at the centre (j + ½, i + ½).
     return interpolate_cells(field.values, to_cells(field.origin, field.resolution, points) - 0.5)
 

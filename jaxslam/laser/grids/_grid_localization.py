@@ -13,13 +13,19 @@ from jax.typing import DTypeLike
 from jaxtyping import Bool, Float, PyTree
 from numpy.typing import ArrayLike
 
-from jaxslam.core import _validation as validation
-from jaxslam.core._numbers import check_positive, is_concrete
-from jaxslam.core._record import record, set_field, static
-from jaxslam.core._validation import check_motion
+from jaxslam.core._numbers import is_concrete
+from jaxslam.core._record import field, record, set_field, static
+from jaxslam.core._validation import motion_model
 from jaxslam.core.protocols import Motion
 from jaxslam.core.types import Beams, Estimate, Info, Log, Scan
-from jaxslam.core.validation import at_least
+from jaxslam.core.validation import (
+    InvalidField,
+    at_least,
+    instance_of,
+    positive,
+    refusals_of,
+    require,
+)
 from jaxslam.filters._particles.pose_particles import (
     PoseParticles,
     Region,
@@ -28,7 +34,7 @@ from jaxslam.filters._particles.pose_particles import (
 )
 from jaxslam.filters._particles.pose_steps import MonteCarloFilter
 from jaxslam.filters._reporting import info_of, status_of, with_extra
-from jaxslam.laser.grids._grid import Grid, check_grid, to_cells
+from jaxslam.laser.grids._grid import Grid, grid_map, to_cells
 from jaxslam.laser.grids.beam_models._beam_model import BeamModel, log_likelihood
 from jaxslam.math._arrays import Number, in_dtype
 from jaxslam.math._xla import no_inline
@@ -55,32 +61,34 @@ def beam_log(control: ArrayLike, beams: Beams) -> Log:
         ValueError: shapes that do not fit; outside a trace, angles of valid beams that are not
             finite, or no valid beam at all.
     """
-    if not isinstance(beams, Beams):
-        raise ValueError(f"beam_log: expected Beams, got {type(beams).__name__}")
-    shapes = [np.shape(part) for part in beams]
-    if len(shapes[0]) != 2 or len(set(shapes)) != 1:
-        listed = ", ".join(map(str, shapes))
-        raise ValueError(
-            f"beam_log: expected as many ranges, angles and masks (T, B), got {listed}"
-        )
-    steps = shapes[0][0]
-    if np.ndim(control) != 2 or np.shape(control)[0] != steps:
-        raise ValueError(
-            f"beam_log: expected a control (U,) for each of {steps} scans, got {np.shape(control)}"
-        )
-    concrete = is_concrete(control, beams)
-    xp: ModuleType = np if concrete else jnp
-    controls, ranges, angle, valid = (xp.asarray(part) for part in (control, *beams))
-    # Without max_range only infinite ranges are free.
-    met, free = Beams(ranges, angle, valid).returns()
-    usable = xp.asarray(met | free)
-    if concrete:
-        lost = valid & (ranges > 0) & ~np.isfinite(angle)
-        if lost.any():
-            step = int(np.argmax(lost.any(axis=1)))
-            raise ValueError(f"beam_log: scan {step}: the angle of a valid beam is not finite")
-        if not usable.any():
-            raise ValueError(f"beam_log: none of {steps} scans has a valid beam")
+    with refusals_of("beam_log"):
+        require("beams", beams, instance_of(Beams))
+        shapes = [np.shape(part) for part in beams]
+        if len(shapes[0]) != 2 or len(set(shapes)) != 1:
+            listed = ", ".join(map(str, shapes))
+            raise InvalidField(
+                "beams", f"expected as many ranges, angles and masks (T, B), got {listed}"
+            )
+        steps = shapes[0][0]
+        if np.ndim(control) != 2 or np.shape(control)[0] != steps:
+            raise InvalidField(
+                "control", f"expected one (U,) for each of {steps} scans, got {np.shape(control)}"
+            )
+        concrete = is_concrete(control, beams)
+        xp: ModuleType = np if concrete else jnp
+        controls, ranges, angle, valid = (xp.asarray(part) for part in (control, *beams))
+        # Without max_range only infinite ranges are free.
+        met, free = Beams(ranges, angle, valid).returns()
+        usable = xp.asarray(met | free)
+        if concrete:
+            lost = valid & (ranges > 0) & ~np.isfinite(angle)
+            if lost.any():
+                step = int(np.argmax(lost.any(axis=1)))
+                raise InvalidField(
+                    "beams", f"the angle of a valid beam of scan {step} is not finite"
+                )
+            if not usable.any():
+                raise InvalidField("beams", f"none of {steps} scans has a valid beam")
     z = xp.stack([xp.minimum(ranges, _NOTHING), angle], axis=-1)
     scan = Scan(
         z=xp.where(usable[..., None], z, 0.0).astype(controls.dtype),
@@ -125,14 +133,14 @@ class _FreeSpace(Region):
         return jnp.concatenate([mean, jnp.zeros(1, dtype)]), cov
 
 
-def _free_space(name: str, grid: Grid, box: Float[np.ndarray, "2 2"] | None) -> _FreeSpace:
+def _free_space(grid: Grid, box: Float[np.ndarray, "2 2"] | None) -> _FreeSpace:
     """The free cells of a map whose centres lie in a box, None for all.
 
-    Raises ValueError, which begins with a caller's name, if there is no such cell.
+    Raises InvalidField if there is no such cell.
     """
     free = np.asarray(grid.log_odds) < 0
     if not free.any():
-        raise ValueError(f"{name}: the map has no free cell (log-odds below 0)")
+        raise InvalidField("grid", "it has no free cell (log-odds below 0)")
     origin, cell = np.asarray(grid.origin, np.float64), float(np.asarray(grid.resolution))
     c, s = np.cos(origin[2]), np.sin(origin[2])
     sides = cell * np.array([[c, s], [-s, c]])
@@ -141,7 +149,7 @@ def _free_space(name: str, grid: Grid, box: Float[np.ndarray, "2 2"] | None) -> 
     if box is not None:
         free = free & ((middle >= box[0]) & (middle <= box[1])).all(axis=2)
         if not free.any():
-            raise ValueError(f"{name}: no free cell of the map is in the box {box.tolist()}")
+            raise InvalidField("box", f"no free cell of the map is in {box.tolist()}")
     return _FreeSpace(middle[free], sides)
 
 
@@ -178,18 +186,18 @@ class GridLocalization(MonteCarloFilter):
     cell (in the box), a model that is none, an exponent not above 0 or stride below 1.
     """
 
-    grid: Grid
+    grid: Grid = field(check=grid_map)
     """a map with a free cell"""
-    model: BeamModel
+    model: BeamModel = field(check=instance_of(BeamModel))
     """as `LikelihoodField` or `RayCast`"""
-    motion: Motion
+    motion: Motion = field(check=motion_model)
     """motion model; for odometry `motion.Odometry` with `odometry_controls`"""
     particles: int = static(check=at_least(1))
     """capacity P, at least 1; a step has P · B/stride look-ups"""
     _: dataclasses.KW_ONLY
-    exponent: Number = 0.1
+    exponent: Number = field(default=0.1, check=positive)
     """of the likelihood, above 0; differentiable"""
-    stride: int = static(default=1)
+    stride: int = static(default=1, check=at_least(1))
     """use each n-th beam, at least 1"""
     prepared: PyTree = dataclasses.field(init=False, repr=False)
     """result of `model.prepare` for the map"""
@@ -198,18 +206,11 @@ class GridLocalization(MonteCarloFilter):
     measurements = _BEAM
 
     def __post_init__(self) -> None:
-        name = type(self).__name__
-        check_grid(name, self.grid)
         if not is_concrete(self.grid):
-            raise ValueError(
-                f"{name}: expected a grid outside a trace, since its free cells are found"
-            )
-        validation.check_record(name, "model", self.model, BeamModel)
-        check_motion(name, self.motion)
-        validation.check_count(f"{name}: stride", self.stride)
-        check_positive(name, exponent=self.exponent)
+            reason = "expected one outside a trace, since its free cells are found"
+            raise InvalidField("grid", reason)
         box = None if self.box is None else np.asarray(self.box)
-        set_field(self, "region", _free_space(name, self.grid, box))
+        set_field(self, "region", _free_space(self.grid, box))
         set_field(self, "prepared", self.model.prepare(self.grid))
         super().__post_init__()
 

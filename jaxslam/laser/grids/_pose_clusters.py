@@ -12,6 +12,7 @@ from jax import Array
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
+from jaxslam.core.validation import InvalidField, refusals_of
 from jaxslam.filters._particles.pose_particles import weighted_pose_moments
 
 
@@ -49,15 +50,17 @@ def clusters(
         ValueError: shapes, bins not above 0, or no particle of positive weight.
     """
     poses, weights = np.asarray(pose, np.float64), np.asarray(log_weight, np.float64)
-    if poses.ndim != 2 or poses.shape[1] != 3 or weights.shape != poses.shape[:1]:
-        raise ValueError(
-            f"clusters: expected poses (P, 3) and weights (P,), got {poses.shape}, {weights.shape}"
-        )
-    if np.shape(bins) != (3,) or not all(np.isfinite(b) and b > 0 for b in bins):
-        raise ValueError(f"clusters: expected bins of three sizes above 0, got {bins!r}")
-    used = np.flatnonzero(np.isfinite(weights) & np.isfinite(poses).all(axis=1))
-    if len(used) == 0:
-        raise ValueError("clusters: no particle has a finite pose and a positive weight")
+    with refusals_of("clusters"):
+        if poses.ndim != 2 or poses.shape[1] != 3 or weights.shape != poses.shape[:1]:
+            raise InvalidField(
+                "pose",
+                f"expected poses (P, 3) and weights (P,), got {poses.shape}, {weights.shape}",
+            )
+        if np.shape(bins) != (3,) or not all(np.isfinite(b) and b > 0 for b in bins):
+            raise InvalidField("bins", f"expected three sizes above 0, got {bins!r}")
+        used = np.flatnonzero(np.isfinite(weights) & np.isfinite(poses).all(axis=1))
+        if len(used) == 0:
+            raise InvalidField("", "no particle has a finite pose and a positive weight")
     # Relative to the largest: weights of any scale, without underflow of all.
     w = np.exp(weights[used] - weights[used].max())
     w = w / w.sum()

@@ -9,9 +9,19 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree, UInt8
 from numpy.typing import ArrayLike
 
-from jaxslam.core._numbers import check_real, is_concrete, shape_text
+from jaxslam.core._numbers import is_concrete
+from jaxslam.core._reprs import describe, shape_text
+from jaxslam.core.validation import (
+    InvalidField,
+    one_of,
+    or_none,
+    positive,
+    real,
+    refusals_of,
+    require,
+)
 from jaxslam.laser.grids._distance import squared_distances
-from jaxslam.laser.grids._grid import Grid, check_grid, interpolate_cells, to_cells
+from jaxslam.laser.grids._grid import Grid, grid_map, interpolate_cells, to_cells
 from jaxslam.laser.grids._traversal import MOST, OFF, STOP, march
 from jaxslam.math._xla import hot_jit
 
@@ -47,7 +57,11 @@ def ray_map(grid: Grid, *, method: str | None = None, skip: bool = True) -> RayM
     Raises:
         ValueError: a grid that is none, or without a free cell; an unknown method.
     """
-    check_grid("ray_map", grid)
+    with refusals_of("ray_map"):
+        require("grid", grid, grid_map)
+        require("method", method, or_none(one_of(*METHODS)))
+        if is_concrete(grid.log_odds) and not np.any(np.asarray(grid.log_odds) < 0):
+            raise InvalidField("grid", "it has no free cell (log-odds below 0)")
     if method is None:
         method = "cells"
         # p may be the share of a cell that is solid with more than three log-odds, so at least two
@@ -58,17 +72,8 @@ def ray_map(grid: Grid, *, method: str | None = None, skip: bool = True) -> RayM
             between = log_odds[(log_odds > log_odds.min()) & (log_odds < log_odds.max())]
             if between.size and between.min() < between.max():
                 method = "surface"
-    check_method("ray_map", method)
-    if is_concrete(grid.log_odds) and not np.any(np.asarray(grid.log_odds) < 0):
-        raise ValueError("ray_map: the map has no free cell (log-odds below 0)")
     rays: RayMap = _ray_map(grid, method, skip)
     return rays
-
-
-def check_method(name: str, method: str) -> None:
-    """Raise ValueError on an unknown method."""
-    if method not in METHODS:
-        raise ValueError(f"{name}: expected a method of {', '.join(METHODS)}, got {method!r}")
 
 
 @partial(jax.jit, static_argnames=("method", "skip"), inline=True)
@@ -144,28 +149,27 @@ def cast(
         ValueError: a grid that is none, shapes, numbers that are not finite, max_range not above 0;
             outside a trace, a pose off the map.
     """
-    if not isinstance(grid, Grid | RayMap):
-        raise ValueError(f"cast: expected a Grid or a RayMap, got {type(grid).__name__}")
-    check_real("cast", pose=pose, angles=angles, max_range=max_range)
-    pose, angles = jnp.asarray(pose), jnp.asarray(angles)
-    if pose.ndim < 1 or pose.shape[-1] != 3:
-        raise ValueError(f"cast: expected poses (x, y, θ), got shape {shape_text(pose)}")
-    if angles.ndim != 1 or angles.size == 0:
-        raise ValueError(f"cast: expected angles of shape (at least 1,), got {shape_text(angles)}")
-    if is_concrete(angles) and not np.all(np.isfinite(angles)):
-        raise ValueError("cast: expected finite angles")
-    if is_concrete(max_range) and not (
-        np.shape(max_range) == () and 0 < float(np.asarray(max_range)) < np.inf
-    ):
-        raise ValueError(f"cast: expected one max_range above 0, got {max_range!r}")
-    if isinstance(grid, Grid):
-        grid = ray_map(grid, skip=False)
-    _check_on_map(grid, pose)
+    with refusals_of("cast"):
+        if not isinstance(grid, Grid | RayMap):
+            raise InvalidField("grid", f"expected a Grid or a RayMap, got {describe(grid)}")
+        require("pose", pose, real)
+        require("angles", angles, real)
+        require("max_range", max_range, positive)
+        pose, angles = jnp.asarray(pose), jnp.asarray(angles)
+        if pose.ndim < 1 or pose.shape[-1] != 3:
+            raise InvalidField("pose", f"expected poses (x, y, θ), got shape {shape_text(pose)}")
+        if angles.ndim != 1 or angles.size == 0:
+            raise InvalidField("angles", f"expected shape (at least 1,), got {shape_text(angles)}")
+        if is_concrete(angles) and not np.all(np.isfinite(angles)):
+            raise InvalidField("angles", "expected finite numbers")
+        if isinstance(grid, Grid):
+            grid = ray_map(grid, skip=False)
+        _check_on_map(grid, pose)
     return _cast(grid, pose, angles, max_range)
 
 
 def _check_on_map(grid: RayMap, pose: Array) -> None:
-    """Raise ValueError on a pose that is not finite or off the map; nothing within a trace."""
+    """Raise InvalidField on a pose that is not finite or off the map; nothing within a trace."""
     if not is_concrete(grid, pose):
         return
     flat = np.asarray(pose).reshape(-1, 3)
@@ -176,9 +180,8 @@ def _check_on_map(grid: RayMap, pose: Array) -> None:
     inside = np.all((local >= 0) & (local <= size), axis=1) & np.isfinite(flat[:, 2])
     if not inside.all():
         k = int(np.argmin(inside))
-        raise ValueError(
-            f"cast: pose {k}, {flat[k].tolist()}, is off the map of {size[0]:g} m × {size[1]:g} m"
-        )
+        off = f"pose {k}, {flat[k].tolist()}, is off the map of {size[0]:g} m × {size[1]:g} m"
+        raise InvalidField("pose", off)
 
 
 @hot_jit

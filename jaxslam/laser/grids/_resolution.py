@@ -5,8 +5,9 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from jaxslam.core._numbers import check_real, is_concrete
-from jaxslam.laser.grids._grid import Field, Grid, centers, check_grid, interpolate
+from jaxslam.core._numbers import is_concrete
+from jaxslam.core.validation import InvalidField, positive, refusals_of, require
+from jaxslam.laser.grids._grid import Field, Grid, centers, grid_map, interpolate
 from jaxslam.math import se2
 
 
@@ -20,12 +21,11 @@ def resample(grid: Grid, resolution: float) -> Grid:
     Raises ValueError on a grid that is none, a resolution that is not above 0, or one within a
     trace, since it sets the shape.
     """
-    check_grid("resample", grid)
-    if not is_concrete(resolution, grid.resolution):
-        raise ValueError("resample: the resolution sets the shape: expected one outside the trace")
-    check_real("resample", resolution=resolution)
-    if not 0 < resolution < np.inf:
-        raise ValueError(f"resample: expected a resolution above 0, got {resolution}")
+    with refusals_of("resample"):
+        require("grid", grid, grid_map)
+        require("resolution", resolution, positive)
+        if not is_concrete(resolution, grid.resolution):
+            raise InvalidField("resolution", "it sets the shape: expected one outside the trace")
     factor = float(resolution) / float(grid.resolution)
     log_odds = jnp.asarray(grid.log_odds)
     up, across = (jnp.asarray(_overlaps(n, factor), log_odds.dtype) for n in log_odds.shape)
@@ -50,21 +50,24 @@ def crop(grid: Grid, low: ArrayLike, high: ArrayLike) -> Grid:
 
     Raises ValueError on a grid that is none, corners within a trace, and a box off the map.
     """
-    check_grid("crop", grid)
-    if not is_concrete(low, high, grid.resolution):
-        raise ValueError("crop: the box sets the shape: expected corners outside the trace")
-    corners = np.stack([np.asarray(low, float), np.asarray(high, float)])
-    if corners.shape != (2, 2) or not np.all(np.isfinite(corners)):
-        raise ValueError(f"crop: expected two corners (x, y), got {low!r} and {high!r}")
+    with refusals_of("crop"):
+        require("grid", grid, grid_map)
+        if not is_concrete(low, high, grid.resolution):
+            raise InvalidField("", "the box sets the shape: expected corners outside the trace")
+        corners = np.stack([np.asarray(low, float), np.asarray(high, float)])
+        if corners.shape != (2, 2) or not np.all(np.isfinite(corners)):
+            raise InvalidField("", f"expected two corners (x, y), got {low!r} and {high!r}")
     cells = corners / float(grid.resolution)
     height, width = np.shape(grid.log_odds)
     # 1e-9: a corner on a border between cells takes no further cell by rounding.
     first = np.maximum(np.floor(cells[0] + 1e-9), 0).astype(int)
     last = np.minimum(np.ceil(cells[1] - 1e-9), (width, height)).astype(int)
     if np.any(first >= last):
-        raise ValueError(
-            f"crop: the box from {corners[0]} to {corners[1]} has no cell of the map, which has "
-            f"{width} × {height} of {grid.resolution} m"
+        raise InvalidField(
+            "",
+            f"the box from {corners[0]} to {corners[1]} has no cell of the map, which has "
+            f"{width} × {height} of {grid.resolution} m",
+            owner="crop",
         )
     shift = jnp.asarray([*(first * float(grid.resolution)), 0.0], jnp.result_type(float))
     log_odds = grid.log_odds[first[1] : last[1], first[0] : last[0]]
@@ -82,8 +85,9 @@ def correlation(a: Grid, b: Grid) -> Float[Array, ""]:
 
     Thrun, Burgard & Fox 2005, "Probabilistic robotics", section 6.5, with a mean of each map.
     """
-    check_grid("correlation", a)
-    check_grid("correlation", b)
+    with refusals_of("correlation"):
+        require("a", a, grid_map)
+        require("b", b, grid_map)
     points = centers(a)
     bordered = Grid(jnp.pad(b.log_odds, 1), b.origin, b.resolution)  # unknown off the map
     corner = jnp.asarray([-1.0, -1.0, 0.0]) * b.resolution

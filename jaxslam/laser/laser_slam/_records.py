@@ -7,8 +7,8 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxslam.core._numbers import check_count, check_positive
 from jaxslam.core.types import Beams
+from jaxslam.core.validation import at_least, positive, refusals_of, require
 from jaxslam.graphs import Graph
 from jaxslam.laser.grids import Grid
 
@@ -50,13 +50,11 @@ class Settings:
     """side of a cell of the map; larger where the map would have more than 4,000 cells a side"""
 
     def __post_init__(self) -> None:
-        caller = "laser_slam.Settings"
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if isinstance(field.default, float):
-                check_positive(caller, **{field.name: value})
-            elif field.name not in _MAY_BE_ZERO or value != 0:
-                check_count(f"{caller}: {field.name}", value)
+        with refusals_of("laser_slam.Settings"):
+            for field in fields(self):
+                least = at_least(0 if field.name in _MAY_BE_ZERO else 1)
+                check = positive if isinstance(field.default, float) else least
+                require(field.name, getattr(self, field.name), check)
 
     @property
     def scans_of_reference(self) -> int:

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.core.types import Beams
+from jaxslam.core.validation import InvalidField, finite, require
 from jaxslam.laser.laser_slam._records import LogOfScans, Settings
 from jaxslam.laser.matching import Points
 from jaxslam.laser.matching._surfaces import Surface, surface
@@ -42,37 +43,31 @@ class Scans(NamedTuple):
     differs from none, as of a robot at rest"""
 
 
-def check_laser_log(name: str, log: LogOfScans) -> None:
-    """Raise ValueError, which begins with a caller's name, unless a log can be used."""
+def laser_log(value: LogOfScans) -> LogOfScans:
+    """The check of a log of scans: shapes that fit each other, and finite numbers."""
+    log = value
     shape = np.shape(log.beams.range)
     if len(shape) != 2 or 0 in shape:
-        raise ValueError(f"{name}: expected ranges (scans, beams), at least one, got {shape}")
+        raise InvalidField("beams.range", f"expected (scans, beams), at least one, got {shape}")
     if np.shape(log.beams.angle) != shape or np.shape(log.beams.valid) != shape:
-        raise ValueError(f"{name}: expected angles and masks {shape}, as the ranges have")
-    if np.shape(log.raw) != (shape[0], 3):
-        raise ValueError(
-            f"{name}: expected raw odometry (x, y, θ) at each of {shape[0]} scans, got "
-            f"{np.shape(log.raw)}"
-        )
-    if np.shape(log.time) != (shape[0],):
-        raise ValueError(f"{name}: expected {shape[0]} times, got {np.shape(log.time)}")
-    if log.odometry_known is not None and np.shape(log.odometry_known) != (shape[0],):
-        raise ValueError(
-            f"{name}: expected odometry_known of each of {shape[0]} scans, got "
-            f"{np.shape(log.odometry_known)}"
-        )
-    if np.shape(log.mount) != (3,) or not np.isfinite(log.mount).all():
-        raise ValueError(f"{name}: expected a mount of three finite numbers, got {log.mount}")
+        raise InvalidField("beams", f"expected angles and masks {shape}, as the ranges have")
+    for field, axes in (("raw", (3,)), ("time", ()), ("odometry_known", ())):
+        part = getattr(log, field)
+        got, expected = np.shape(part), (shape[0], *axes)
+        if got != expected and not (field == "odometry_known" and part is None):
+            raise InvalidField(field, f"expected shape {expected}, as of the scans, got {got}")
+    require("mount", log.mount, finite(3))
     lost = np.asarray(log.beams.valid, bool) & ~np.isfinite(log.beams.angle)
-    for quantity, bad in (
-        ("raw odometry", ~np.isfinite(log.raw).all(axis=1)),
-        ("the time", ~np.isfinite(log.time)),
-        ("the angle of a valid beam", lost.any(axis=1)),
+    for field, noun, bad in (
+        ("raw", "the odometry", ~np.isfinite(log.raw).all(axis=1)),
+        ("time", "the time", ~np.isfinite(log.time)),
+        ("beams.angle", "the angle of a valid beam", lost.any(axis=1)),
     ):
         if bad.any():
-            raise ValueError(f"{name}: {quantity} of scan {int(bad.argmax())} is not finite")
+            raise InvalidField(field, f"{noun} of scan {int(bad.argmax())} is not finite")
     if not log.max_range > 0:
-        raise ValueError(f"{name}: expected a max_range above 0, got {log.max_range}")
+        raise InvalidField("max_range", f"expected a number above 0, got {log.max_range}")
+    return log
 
 
 def hits_of(beams: Beams, max_range: float) -> Beams:

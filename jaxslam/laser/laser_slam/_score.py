@@ -10,6 +10,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from jaxslam import graphs
+from jaxslam.core.validation import InvalidField, refusals_of
 from jaxslam.laser.laser_slam import _end_covariances as end_covariances
 from jaxslam.laser.laser_slam._assembly import ROOM, relative_covs
 from jaxslam.laser.laser_slam._records import LoopOutcome, Loops, Solved
@@ -43,16 +44,18 @@ def relation_covs(
     """
     i, j = np.asarray(first), np.asarray(second)
     count = len(solved.poses)
-    for scans in (i, j):
-        if scans.ndim != 1 or scans.shape != i.shape or scans.dtype.kind not in "iu":
-            raise ValueError(
-                f"relation_covs: expected two rows of whole numbers, got {i.shape} and {j.shape}"
-            )
-        if len(scans) and not (scans.min() >= 0 and scans.max() < count):
-            raise ValueError(
-                f"relation_covs: expected scans from 0 to {count - 1}, got {scans.min()} to "
-                f"{scans.max()}"
-            )
+    with refusals_of("relation_covs"):
+        for scans in (i, j):
+            if scans.ndim != 1 or scans.shape != i.shape or scans.dtype.kind not in "iu":
+                raise InvalidField(
+                    "first, second",
+                    f"expected two rows of whole numbers, got {i.shape} and {j.shape}",
+                )
+            if len(scans) and not (scans.min() >= 0 and scans.max() < count):
+                raise InvalidField(
+                    "first, second",
+                    f"expected scans from 0 to {count - 1}, got {scans.min()} to {scans.max()}",
+                )
     a, b = solved.base[i], solved.base[j]
     between = np.zeros((len(i), 3, 3))
     apart = a != b

@@ -7,6 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 from jaxslam import graphs
+from jaxslam.core.validation import refusals_of, require
 from jaxslam.laser.laser_slam import _end_covariances as end_covariances
 from jaxslam.laser.laser_slam._assembly import ROOM
 from jaxslam.laser.laser_slam._log_map import frame_of, map_of
@@ -15,7 +16,7 @@ from jaxslam.laser.laser_slam._odometry.log_odometry import laser_odometry
 from jaxslam.laser.laser_slam._odometry.raw import steps_of
 from jaxslam.laser.laser_slam._odometry.tracking import Odometry
 from jaxslam.laser.laser_slam._records import LogOfScans, LoopOutcome, Settings, Solved
-from jaxslam.laser.laser_slam._scan_points import check_laser_log, scans_of
+from jaxslam.laser.laser_slam._scan_points import laser_log, scans_of
 from jaxslam.math import numpy_poses as poses
 from jaxslam.math._arrays import float64
 
@@ -42,7 +43,8 @@ def solve(
     Raises:
         ValueError: on a log whose parts do not fit, or are not finite.
     """
-    check_laser_log("laser_slam.solve", log)
+    with refusals_of("laser_slam.solve"):
+        require("log", log, laser_log)
     seconds: dict[str, float] = {}
     began = time.perf_counter()
 

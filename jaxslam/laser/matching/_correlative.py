@@ -12,8 +12,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxslam.core._numbers import check_positive, is_concrete
-from jaxslam.core._record import record, static
+from jaxslam.core._record import field, record, static
+from jaxslam.core.validation import (
+    at_least,
+    finite,
+    in_range,
+    or_none,
+    positive,
+)
 from jaxslam.laser.grids._distance import near_distances
 from jaxslam.laser.grids._grid import Field, Grid, interpolate, to_cells
 from jaxslam.laser.matching._field import field_cost
@@ -158,6 +164,19 @@ _REACH = 4.0
 """Distance in σ beyond which a point scores 0, where exp(-d²/2σ²) is below 3.4e-4."""
 
 
+def _at_least_zero(value: float) -> float:
+    """The check of a finite number >= 0."""
+    finite(least=0.0)(value)
+    return value
+
+
+def _power_of_two(value: int) -> int:
+    """The check of 2, 4, 8, …"""
+    if at_least(2)(value) & (value - 1):
+        raise ValueError(f"expected 2, 4, 8, …, got {value}")
+    return value
+
+
 @record
 class Correlative(Matcher):
     """The pose of a window with the highest mean score of the points, exp(-d²/2σ²) each.
@@ -183,38 +202,25 @@ class Correlative(Matcher):
     """
 
     _: dataclasses.KW_ONLY
-    window: float = static(default=0.3)
+    window: float = static(default=0.3, check=_at_least_zero)
     """[m] to either side"""
-    turn_window: float = static(default=float(np.deg2rad(20.0)))
+    turn_window: float = static(default=float(np.deg2rad(20.0)), check=_at_least_zero)
     """[rad] to either side"""
-    turn: float = static(default=float(np.deg2rad(0.5)))
+    turn: float = static(default=float(np.deg2rad(0.5)), check=positive)
     """[rad] between headings"""
-    cell: float = static(default=0.05)
+    cell: float = static(default=0.05, check=positive)
     """resolution of the grids [m], which fixes the number of shifts; that of another grid counts in
     place of it, with as many cells"""
-    sigma: float = static(default=0.05)
+    sigma: float = static(default=0.05, check=positive)
     """[m] of the score"""
-    block: int = static(default=4)
+    block: int = static(default=4, check=_power_of_two)
     """shifts along each axis that are bounded together at first: 2, 4, 8, …"""
-    ambiguous: Number | None = 0.95
+    ambiguous: Number | None = field(default=0.95, check=or_none(in_range(0.0, 1.0, open=True)))
     """the status is AMBIGUOUS where a pose more than `apart` away from the best scores above this
     share of it; None does not look for one"""
-    apart: Number = 0.3
+    apart: Number = field(default=0.3, check=positive)
     """[m], angles times the RMS range"""
     of_grid = True
-
-    def __post_init__(self) -> None:
-        name = "Correlative"
-        check_positive(name, turn=self.turn, cell=self.cell, sigma=self.sigma, apart=self.apart)
-        if not (0 <= self.window < np.inf and 0 <= self.turn_window < np.inf):
-            got = f"{self.window}, {self.turn_window}"
-            raise ValueError(f"{name}: expected window and turn_window of at least 0, got {got}")
-        if self.block < 2 or self.block & (self.block - 1):
-            raise ValueError(f"{name}: expected block 2, 4, 8, …, got {self.block}")
-        share = self.ambiguous
-        if share is not None and is_concrete(share) and not 0 < share < 1:
-            raise ValueError(f"{name}: expected ambiguous in (0, 1), or None, got {share}")
-        super().__post_init__()
 
     @property
     def _shifts(self) -> int:

@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxslam.core._numbers import check_count, check_positive
-from jaxslam.core._record import record, static
+from jaxslam.core._record import field, record, static
+from jaxslam.core.validation import at_least, or_none, positive
 from jaxslam.graphs._solver.kernels import Kernel
 from jaxslam.laser.grids._distance import distance_field
 from jaxslam.laser.grids._grid import Field, Grid, interpolate, to_cells
@@ -74,30 +74,22 @@ class FieldMatcher(Matcher):
     """
 
     _: dataclasses.KW_ONLY
-    reach: Number = 0.5
+    reach: Number = field(default=0.5, check=positive)
     """largest distance that counts [m]"""
     kernel: Kernel | None = None
     """ρ, as `graphs.Huber()`, of (d/scale)²; None for squares"""
-    scale: Number = 0.1
+    scale: Number = field(default=0.1, check=positive)
     """[m] of the kernel and of `Match.score`"""
-    iterations: int = static(default=50)
+    iterations: int = static(default=50, check=at_least(1))
     """at most"""
-    tolerance: Number = 1e-6
+    tolerance: Number = field(default=1e-6, check=positive)
     """of convergence: the motion of a step [m], angles times the RMS range"""
     least_score: Number = 0.5
     """`Match.score` below which the status is UNLIKE"""
-    least_condition: Number | None = 0.01
+    least_condition: Number | None = field(default=0.01, check=or_none(positive))
     """`Match.condition` below which the status is DEGENERATE; None: never"""
     name = "field"
     of_grid = True
-
-    def __post_init__(self) -> None:
-        name = "FieldMatcher"
-        check_positive(name, reach=self.reach, scale=self.scale, tolerance=self.tolerance)
-        if self.least_condition is not None:
-            check_positive(name, least_condition=self.least_condition)
-        check_count(f"{name}: iterations", self.iterations)
-        super().__post_init__()
 
     def prepare(self, reference: Grid) -> Field:
         return distance_field(reference, truncate=in_dtype(self, reference.log_odds.dtype).reach)

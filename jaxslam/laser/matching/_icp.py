@@ -3,14 +3,15 @@
 With distances between points, or from points to lines (PL-ICP).
 """
 
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxslam.core._numbers import check_count, check_positive, is_concrete
-from jaxslam.core._record import record, static
+from jaxslam.core._numbers import is_concrete
+from jaxslam.core._record import check_field, field, record, static
+from jaxslam.core.validation import at_least, instance_of, or_none, positive
 from jaxslam.graphs._solver.kernels import Kernel
 from jaxslam.laser.matching._closed_form import (
     Quadratic,
@@ -41,49 +42,43 @@ from jaxslam.math._arrays import Number, in_dtype
 from jaxslam.math.angles import wrap
 
 
+def _share(value: Any) -> Any:
+    """The check of a share, above 0 and at most 1."""
+    if is_concrete(value) and not 0 < positive(value) <= 1:
+        raise ValueError(f"expected a number in (0, 1], got {value}")
+    return value
+
+
 @record
 class IcpSettings:
     """The numbers of `PointToPoint` and `PointToLine`; ValueError if out of range."""
 
-    reach: Number = 0.5
+    reach: Number = field(default=0.5, check=positive)
     """largest distance of partners [m]"""
-    trim: Number | None = None
+    trim: Number | None = field(default=None, check=or_none(_share))
     """share of the pairs kept at each step, those of the smallest residuals; None for all"""
     kernel: Kernel | None = None
     """robust, as `graphs.Huber()`, of (residual/scale)²; None for squares"""
-    scale: Number = 0.1
+    scale: Number = field(default=0.1, check=positive)
     """[m] of the kernel and of `Match.score`"""
-    span: int = static(default=SPAN)
+    span: int = static(default=SPAN, check=at_least(1))
     """neighbours on each side that a line is fitted to"""
-    gap: Number = GAP
+    gap: Number = field(default=GAP, check=positive)
     """[m] between points beyond which they are not neighbours"""
-    lone: Number | None = None
+    lone: Number | None = field(default=None, check=or_none(positive))
     """of `PointToLine`: the factor of the distance from a point that has no line, as in clutter;
     None leaves such points out"""
-    iterations: int = static(default=200)
+    iterations: int = static(default=200, check=at_least(1))
     """at most"""
-    tolerance: Number = 1e-6
+    tolerance: Number = field(default=1e-6, check=positive)
     """of convergence: the motion of a step [m], angles times the RMS range; at least 8 eps of the
     coordinates, 3e-5 at 30 m in float32"""
-    fewest: int = static(default=10)
+    fewest: int = static(default=10, check=at_least(0))
     """pairs below which the status is TOO_FEW"""
     least_score: Number = 0.5
     """`Match.score` below which the status is UNLIKE"""
-    least_condition: Number | None = 0.01
+    least_condition: Number | None = field(default=0.01, check=or_none(positive))
     """`Match.condition` below which the status is DEGENERATE; None: never"""
-
-    def __post_init__(self) -> None:
-        name, trim = "IcpSettings", self.trim
-        check_positive(name, reach=self.reach, scale=self.scale, gap=self.gap)
-        check_positive(name, tolerance=self.tolerance)
-        for optional in ("lone", "least_condition"):
-            if getattr(self, optional) is not None:
-                check_positive(name, **{optional: getattr(self, optional)})
-        check_count(f"{name}: span", self.span)
-        check_count(f"{name}: iterations", self.iterations)
-        check_count(f"{name}: fewest", self.fewest, 0)
-        if trim is not None and is_concrete(trim) and not 0 < trim <= 1:
-            raise ValueError(f"{name}: expected trim in (0, 1], got {trim}")
 
 
 class _PairedPoints(NamedTuple):
@@ -110,9 +105,7 @@ class Icp(Matcher):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not isinstance(self.settings, IcpSettings):
-            got = type(self.settings).__name__
-            raise ValueError(f"{type(self).__name__}: expected settings of IcpSettings, got {got}")
+        check_field(self, "settings", instance_of(IcpSettings))
 
     def residual(self, of: Surface, moved: Array, partner: Array) -> Float[Array, "N"]:
         """The residual [m] between each point of a scan and its partner."""

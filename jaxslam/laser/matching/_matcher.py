@@ -2,7 +2,7 @@
 
 from enum import IntEnum
 from functools import partial
-from typing import ClassVar, NamedTuple, TypeAlias
+from typing import Any, ClassVar, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -10,9 +10,11 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 from numpy.typing import ArrayLike
 
-from jaxslam.core._numbers import is_concrete, shape_text
+from jaxslam.core._numbers import is_concrete
+from jaxslam.core._reprs import shape_text
 from jaxslam.core.protocols import Component
-from jaxslam.laser.grids._grid import Grid, check_grid
+from jaxslam.core.validation import Check, InvalidField, instance_of, refusals_of, require
+from jaxslam.laser.grids._grid import Grid, grid_map
 from jaxslam.laser.matching._point_sets import Points, Prior
 from jaxslam.math._arrays import in_dtype
 from jaxslam.math._definite import asymmetric, indefinite
@@ -129,25 +131,25 @@ def match(
         ValueError: a reference of another kind, arrays that do not fit each other, numbers that
             are not finite. A scan without points is a status.
     """
-    batch = _batch_of(matcher, reference, points, start)
-    if prior is not None:
-        if not isinstance(prior, Prior):
-            raise ValueError(f"match: expected a Prior, got {type(prior).__name__}")
-        if np.shape(prior.pose) != (*batch, 3) or np.shape(prior.information) != (*batch, 3, 3):
-            size = " x ".join(str(axis) for axis in (*batch, 3))
-            raise ValueError(
-                f"match: expected a prior of a pose {size} and an information {size} x 3, got "
-                f"{shape_text(prior.pose)} and {shape_text(prior.information)}"
-            )
-        if is_concrete(prior):
-            mean, information = np.asarray(prior.pose), np.asarray(prior.information)
-            if not (np.all(np.isfinite(mean)) and np.all(np.isfinite(information))):
-                raise ValueError("match: expected a finite prior")
-            # 1e-4: the inverse of a covariance in float32 may have few digits.
-            if asymmetric(information, 1e-4).any() or indefinite(information, 1e-4).any():
-                raise ValueError(
-                    "match: expected a symmetric information of the prior, positive semi-definite"
+    with refusals_of("match"):
+        batch = _batch_of(matcher, reference, points, start)
+        if prior is not None:
+            require("prior", prior, instance_of(Prior))
+            if np.shape(prior.pose) != (*batch, 3) or np.shape(prior.information) != (*batch, 3, 3):
+                size = " x ".join(str(axis) for axis in (*batch, 3))
+                raise InvalidField(
+                    "prior",
+                    f"expected a pose {size} and an information {size} x 3, got "
+                    f"{shape_text(prior.pose)} and {shape_text(prior.information)}",
                 )
+            if is_concrete(prior):
+                mean, information = np.asarray(prior.pose), np.asarray(prior.information)
+                if not (np.all(np.isfinite(mean)) and np.all(np.isfinite(information))):
+                    raise InvalidField("prior", "expected finite numbers")
+                # 1e-4: the inverse of a covariance in float32 may have few digits.
+                if asymmetric(information, 1e-4).any() or indefinite(information, 1e-4).any():
+                    reason = "expected a symmetric information, positive semi-definite"
+                    raise InvalidField("prior", reason)
     with jax.numpy_dtype_promotion("standard"):  # the user may have refused promotion: "strict"
         dtype = jnp.result_type(points.position, *floats(reference), jnp.float32)
     start = jnp.asarray(start, dtype)
@@ -181,48 +183,46 @@ def _match_many(
 
 
 def _batch_of(
-    matcher: object, reference: object, points: object, start: ArrayLike
+    matcher: Matcher, reference: Reference, points: Points, start: ArrayLike
 ) -> tuple[int, ...]:
-    """The leading axis of the arguments, () of a pair; ValueError on what `match` refuses."""
-    if not isinstance(matcher, Matcher):
-        raise ValueError(f"match: expected a Matcher, got {type(matcher).__name__}")
+    """The leading axis of the arguments, () of a pair; InvalidField on what `match` refuses."""
+    require("matcher", matcher, instance_of(Matcher))
     kind = Grid if matcher.of_grid else Points
-    if not isinstance(reference, kind):
-        raise ValueError(
-            f"match: {matcher.name} takes a reference of {kind.__name__}, "
-            f"got {type(reference).__name__}"
-        )
+    require("reference", reference, instance_of(kind, f"; {matcher.name} takes {kind.__name__}"))
     batch: tuple[int, ...] = np.shape(start)[:-1]
     if len(batch) > 1 or np.shape(start)[-1:] != (3,):
-        raise ValueError(f"match: expected a start of poses (x, y, θ), got {shape_text(start)}")
-    _check_points("match: points", points, batch)
+        raise InvalidField("start", f"expected poses (x, y, θ), got {shape_text(start)}")
+    require("points", points, _points_of(batch))
     if isinstance(reference, Points):
-        _check_points("match: reference", reference, batch)
+        require("reference", reference, _points_of(batch))
         if not reference.valid.shape[-1]:
-            raise ValueError("match: expected a reference of at least one point, valid or not")
+            raise InvalidField("reference", "expected at least one point, valid or not")
     elif not batch:
-        check_grid("match", reference)
+        require("reference", reference, grid_map)
     elif np.ndim(reference.log_odds) != 3 or len(reference.log_odds) != batch[0]:
-        raise ValueError(
-            f"match: expected {batch[0]} grids, got log-odds of {shape_text(reference.log_odds)}"
-        )
+        got = shape_text(reference.log_odds)
+        raise InvalidField("reference", f"expected {batch[0]} grids, got log-odds of {got}")
     if is_concrete(start) and not np.all(np.isfinite(np.asarray(start))):
-        raise ValueError(f"match: expected a finite start, got {np.asarray(start)}")
+        raise InvalidField("start", f"expected finite numbers, got {np.asarray(start)}")
     return batch
 
 
-def _check_points(name: str, of: object, batch: tuple[int, ...] = ()) -> None:
-    """Raise ValueError, which begins with a caller's name, unless they are finite `Points`."""
-    if not isinstance(of, Points):
-        raise ValueError(f"{name}: expected Points, got {type(of).__name__}")
-    shape = np.shape(of.valid)
-    if (
-        len(shape) != len(batch) + 1
-        or shape[:-1] != batch
-        or any(np.shape(part) != (*shape, 2) for part in of[:2])
-    ):
-        shapes = ", ".join(shape_text(part) for part in of)
-        expected = " x ".join(str(size) for size in (*batch, "N"))
-        raise ValueError(f"{name}: expected {expected} positions, rays and masks, got {shapes}")
-    if is_concrete(of) and not all(np.all(np.isfinite(np.asarray(part))) for part in of[:2]):
-        raise ValueError(f"{name}: expected finite points; those that are not valid, too")
+def _points_of(batch: tuple[int, ...]) -> Check:
+    """The check of finite `Points` with these leading axes."""
+
+    def check(value: Any) -> Points:
+        points: Points = instance_of(Points)(value)
+        shape = np.shape(points.valid)
+        if (
+            len(shape) != len(batch) + 1
+            or shape[:-1] != batch
+            or any(np.shape(part) != (*shape, 2) for part in points[:2])
+        ):
+            shapes = ", ".join(shape_text(part) for part in points)
+            expected = " x ".join(str(size) for size in (*batch, "N"))
+            raise ValueError(f"expected {expected} positions, rays and masks, got {shapes}")
+        if is_concrete(points) and not all(np.isfinite(np.asarray(p)).all() for p in points[:2]):
+            raise ValueError("expected finite points; those that are not valid, too")
+        return points
+
+    return check

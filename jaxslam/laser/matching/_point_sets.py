@@ -7,8 +7,8 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from jaxslam.core._numbers import check_positive
 from jaxslam.core.types import Beams
+from jaxslam.core.validation import InvalidField, positive, refusals_of, require
 from jaxslam.laser.grids._grid import Grid
 from jaxslam.math import se2
 from jaxslam.math.angles import wrap
@@ -43,12 +43,13 @@ def points(
         ValueError: arrays that are not (B,), a max_range that is not above 0.
     """
     shapes = [np.shape(part) for part in beams]
-    if len(set(shapes)) > 1 or len(shapes[0]) != 1:
-        listed = ", ".join(map(str, shapes))
-        raise ValueError(
-            f"points: expected ranges, angles and masks (B,) of one scan, got {listed}"
-        )
-    check_positive("points", max_range=max_range)
+    with refusals_of("points"):
+        if len(set(shapes)) > 1 or len(shapes[0]) != 1:
+            listed = ", ".join(map(str, shapes))
+            raise InvalidField(
+                "beams", f"expected ranges, angles and masks (B,) of one scan, got {listed}"
+            )
+        require("max_range", max_range, positive)
     r = jnp.asarray(beams.range)
     valid, _ = beams._replace(range=r).returns(
         jnp.asarray(max_range), min_range=jnp.asarray(min_range)
@@ -87,10 +88,9 @@ def raster(
 
     Raises ValueError unless resolution and half_width are above 0 and finite.
     """
-    if not (0 < resolution < np.inf and 0 < half_width < np.inf):
-        raise ValueError(
-            f"raster: expected resolution and half_width above 0, got {resolution}, {half_width}"
-        )
+    with refusals_of("raster"):
+        require("resolution", resolution, positive)
+        require("half_width", half_width, positive)
     # 1e-9: a width that is a multiple of the cells must not get another by rounding.
     size = int(np.ceil(2 * half_width / resolution - 1e-9))
     corner = jnp.asarray(center, of.position.dtype) - 0.5 * size * resolution

@@ -12,6 +12,7 @@ import scipy  # its parts load where they are used
 from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
+from jaxslam.core.validation import InvalidField, positive, refusals_of, require
 from jaxslam.laser.grids import Grid, centers
 from jaxslam.laser.topology._voronoi import Skeleton, skeleton
 
@@ -79,10 +80,9 @@ def topological_map(
     Raises:
         ValueError: as `skeleton`, and on numbers that are not above 0.
     """
-    if not (max_width > 0 and prominence > 0):
-        raise ValueError(
-            f"topological_map: expected numbers above 0, got {max_width} and {prominence}"
-        )
+    with refusals_of("topological_map"):
+        require("max_width", max_width, positive)
+        require("prominence", prominence, positive)
     ridge = skeleton(grid, clearance=clearance)
     height, width = ridge.cells.shape
     away = ridge.clearance.reshape(-1)
@@ -212,14 +212,14 @@ def path_places(poses: ArrayLike, pairs: ArrayLike, *, radius: float) -> PathPla
     """
     points = np.asarray(poses, np.float64)
     edges = np.asarray(pairs, int).reshape(-1, 2)
-    if points.ndim != 2 or len(points) == 0 or not radius > 0:
-        raise ValueError(
-            f"path_places: expected poses and a radius above 0, got {points.shape} and {radius}"
-        )
-    if not np.isfinite(points).all():
-        raise ValueError("path_places: expected finite poses")
-    if len(edges) and not (edges.min() >= 0 and edges.max() < len(points)):
-        raise ValueError(f"path_places: expected pairs of {len(points)} poses, got {edges.max()}")
+    with refusals_of("path_places"):
+        require("radius", radius, positive)
+        if points.ndim != 2 or len(points) == 0:
+            raise InvalidField("poses", f"expected at least one, got shape {points.shape}")
+        if not np.isfinite(points).all():
+            raise InvalidField("poses", "expected finite numbers")
+        if len(edges) and not (edges.min() >= 0 and edges.max() < len(points)):
+            raise InvalidField("pairs", f"expected those of {len(points)} poses, got {edges.max()}")
     centers: list[int] = []
     for k, point in enumerate(points[:, :2]):
         if not centers or np.linalg.norm(points[centers, :2] - point, axis=1).min() > radius:

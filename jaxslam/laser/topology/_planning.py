@@ -8,6 +8,7 @@ import scipy  # its parts load where they are used
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
+from jaxslam.core.validation import InvalidField, refusals_of
 from jaxslam.laser.grids import to_cells
 from jaxslam.laser.topology._places import TopologicalMap, cell_centers, neighbours
 
@@ -33,12 +34,13 @@ def route(places: TopologicalMap, start: ArrayLike, goal: ArrayLike) -> Route:
     ValueError on a point that is not finite or in no place, and if no way leads to the goal.
     """
     ends = np.stack([np.asarray(start, np.float64)[:2], np.asarray(goal, np.float64)[:2]])
-    if not np.isfinite(ends).all():
-        raise ValueError(f"route: expected finite points, got {ends.tolist()}")
-    labels = place_of(places, ends)
-    for name, end, label in zip(("start", "goal"), ends, labels, strict=True):
-        if label < 0:
-            raise ValueError(f"route: the {name} {end} is in no place of the map")
+    with refusals_of("route"):
+        if not np.isfinite(ends).all():
+            raise InvalidField("start, goal", f"expected finite points, got {ends.tolist()}")
+        labels = place_of(places, ends)
+        for name, end, label in zip(("start", "goal"), ends, labels, strict=True):
+            if label < 0:
+                raise InvalidField(name, f"{end} is in no place of the map")
     straight = float(np.linalg.norm(ends[1] - ends[0]))
     count = 2 + int(2 * straight / float(places.grid.resolution))  # half a cell apart
     share = np.linspace(0.0, 1.0, count)[:, None]
@@ -56,7 +58,9 @@ def route(places: TopologicalMap, start: ArrayLike, goal: ArrayLike) -> Route:
         graph, directed=False, indices=at[0], return_predecessors=True
     )
     if not np.isfinite(distance[at[1]]):
-        raise ValueError(f"route: no way leads from place {labels[0]} to place {labels[1]}")
+        raise InvalidField(
+            "", f"no way leads from place {labels[0]} to place {labels[1]}", owner="route"
+        )
     # From the goal back to the start, by the predecessors.
     way = [at[1]]
     while way[-1] != at[0]:
@@ -91,15 +95,17 @@ def place_weights(
         ValueError: on shapes that do not fit, or without a particle of weight above 0.
     """
     table, logs = np.asarray(poses, np.float64), np.asarray(log_weight, np.float64)
-    if table.ndim != 2 or logs.shape != table.shape[:1]:
-        raise ValueError(
-            f"place_weights: expected particles (n, 3) and log-weights (n,), got {table.shape} and "
-            f"{logs.shape}"
-        )
-    if not np.isfinite(table).all() or not (logs < np.inf).all():
-        raise ValueError("place_weights: expected finite poses, and log-weights below infinity")
-    if not len(logs) or not np.isfinite(logs.max()):
-        raise ValueError("place_weights: expected a particle of weight above 0")
+    with refusals_of("place_weights"):
+        if table.ndim != 2 or logs.shape != table.shape[:1]:
+            raise InvalidField(
+                "",
+                f"expected particles (n, 3) and log-weights (n,), got {table.shape} and "
+                f"{logs.shape}",
+            )
+        if not np.isfinite(table).all() or not (logs < np.inf).all():
+            raise InvalidField("", "expected finite poses, and log-weights below infinity")
+        if not len(logs) or not np.isfinite(logs.max()):
+            raise InvalidField("", "expected a particle of weight above 0")
     weight = np.exp(logs - logs.max())
     weight /= weight.sum()
     label = place_of(places, table)

@@ -5,8 +5,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jaxslam.core.validation import InvalidField, positive, refusals_of, require
 from jaxslam.laser.grids import Grid, distance_field
-from jaxslam.laser.grids._grid import check_grid
+from jaxslam.laser.grids._grid import grid_map
 
 _RIDGE = 0.6
 """Slope of the distance field below which a cell is on a ridge. A point whose nearest walls are in
@@ -38,9 +39,9 @@ def skeleton(grid: Grid, *, clearance: float = 0.2) -> Skeleton:
 
     Raises ValueError on a grid that is none, a clearance that is not above 0, or no room for it.
     """
-    check_grid("skeleton", grid)
-    if not clearance > 0:
-        raise ValueError(f"skeleton: expected a clearance above 0, got {clearance}")
+    with refusals_of("skeleton"):
+        require("grid", grid, grid_map)
+        require("clearance", clearance, positive)
     # A border of walls, so that each free cell has eight neighbours in the flat array.
     free = np.pad(np.asarray(grid.log_odds) < 0, 1)
     walls = Grid(np.where(free, -1.0, 1.0), grid.origin, grid.resolution)
@@ -50,7 +51,9 @@ def skeleton(grid: Grid, *, clearance: float = 0.2) -> Skeleton:
     away = np.maximum(np.asarray(field.values, np.float64) - half, 0.0) * free
     fits = free & (away >= clearance)
     if not fits.any():
-        raise ValueError(f"skeleton: no free cell is {clearance} m or more from what is not free")
+        raise InvalidField(
+            "", f"no free cell is {clearance} m or more from what is not free", owner="skeleton"
+        )
     slope = np.hypot(*np.gradient(np.asarray(field.values, np.float64) / (2 * half)))
     cells = fits.copy()
     _thin(cells, away, fits & (slope < _RIDGE), ends=False)

@@ -32,8 +32,8 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Polygon
 
-from jaxslam.core._numbers import check_count
 from jaxslam.core._optional import Unusable, first_line
+from jaxslam.core.validation import InvalidField, at_least, positive, refusals_of, require
 from jaxslam.results.plot._landmarks import ellipses
 from jaxslam.results.plot._style import INK, PAGE, TEXT, TITLE, own_settings, panels_of, titled
 
@@ -113,11 +113,11 @@ class Film(FuncAnimation):
 
     @own_settings()
     def __init__(self, scene: Scene, *, fps: float | None = None, width: float = PAGE) -> None:
-        check_count("Film: frames", scene.frames)
-        fps = np.clip(scene.frames / _SECONDS, _SLOWEST, _FASTEST) if fps is None else fps
-        for name, value in (("fps", fps), ("width", width)):
-            if not 0 < value < np.inf:
-                raise ValueError(f"Film: expected {name} above 0, got {value}")
+        with refusals_of("Film"):
+            require("frames", scene.frames, at_least(1))
+            fps = np.clip(scene.frames / _SECONDS, _SLOWEST, _FASTEST) if fps is None else fps
+            require("fps", fps, positive)
+            require("width", width, positive)
         self.scene = scene
         stage = _Stage(scene, width)
         figure = Figure(figsize=stage.size, dpi=_DPI)
@@ -154,7 +154,11 @@ class Film(FuncAnimation):
             return
         if not writer:
             if kind not in (".gif", ".mp4"):
-                raise ValueError(f"Film.save: expected a name in .gif, .html, .mp4, got {filename}")
+                raise InvalidField(
+                    "filename",
+                    f"expected a name in .gif, .html, .mp4, got {filename}",
+                    owner="Film.save",
+                )
             if kind == ".mp4" and (problem := mp4_problem()):
                 raise Unusable(f"Film.save: {filename} cannot be written ({problem}): save a .gif")
             writer = "pillow" if kind == ".gif" else "ffmpeg"

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
+from jaxslam.core.validation import InvalidField, refusals_of
 from jaxslam.graphs import Factor, Graph
 from jaxslam.graphs._graph import is_successive
 from jaxslam.graphs._solver.model import factors_of
@@ -60,7 +61,8 @@ def graph_figure(
         subtitles: titles of the panels.
         width: width of the figure [in].
     """
-    factors = factors_of("graph_figure", after, factors)
+    with refusals_of("graph_figure"):
+        factors = factors_of(after, factors)
     ratios = [
         (float(value) / len(factors[key].errors), key, row)
         for key in _edge_tables(after, factors)
@@ -147,11 +149,13 @@ def graph_scene(
         ValueError: without iterates, or another number of χ².
     """
     if not iterates or len(chi2) != len(iterates):
-        raise ValueError(
-            f"graph_scene: expected as many χ² as iterates, at least 1, got {len(chi2)} "
-            f"and {len(iterates)}"
+        raise InvalidField(
+            "",
+            f"expected as many χ² as iterates, at least 1, got {len(chi2)} and {len(iterates)}",
+            owner="graph_scene",
         )
-    factors = factors_of("graph_scene", iterates[0], factors)
+    with refusals_of("graph_scene"):
+        factors = factors_of(iterates[0], factors)
     poses = np.stack([np.asarray(graph.poses)[:, :2] for graph in iterates])
     points = np.stack([np.asarray(graph.points)[:, :2] for graph in iterates])
     edges = [_edges(graph, factors) for graph in iterates]

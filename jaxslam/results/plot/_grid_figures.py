@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from jaxslam.consistency.metrics import ate
 from jaxslam.consistency.metrics._paths import transform
 from jaxslam.core.types import Beams
+from jaxslam.core.validation import InvalidField, refusals_of
 from jaxslam.laser.grids import Field, Grid
 from jaxslam.laser.laser_slam import LoopOutcome, Solved
 from jaxslam.laser.topology import Route, TopologicalMap
@@ -62,7 +63,7 @@ def grid_figure(
     """
     path = None if poses is None else np.atleast_2d(np.asarray(poses))
     if beams is not None and (path is None or path.shape[1] != 3):
-        raise ValueError("grid_figure: beams are from the last of poses (x, y, θ)")
+        raise InvalidField("", "beams are from the last of poses (x, y, θ)", owner="grid_figure")
     values = np.asarray(grid[0])
     x, y = _corners(grid, *(np.arange(n + 1) for n in values.shape))
     inner = width - (0.6 if isinstance(grid, Grid) else 1.3)  # beside labels, or a scale, too
@@ -312,13 +313,15 @@ def map_scene(
         ValueError: without maps, other numbers of paths or captions, or a rotated frame.
     """
     count = len(log_odds)
-    if not count or {count} != {len(paths), len(captions)}:
-        raise ValueError(
-            f"map_scene: expected as many paths and texts as maps, at least 1, got {count} maps, "
-            f"{len(paths)} paths and {len(captions)} captions"
-        )
-    if origin[2] != 0:
-        raise ValueError(f"map_scene: expected an origin without yaw, got {origin[2]} rad")
+    with refusals_of("map_scene"):
+        if not count or {count} != {len(paths), len(captions)}:
+            raise InvalidField(
+                "",
+                f"expected as many paths and texts as maps, at least 1, got {count} maps, "
+                f"{len(paths)} paths and {len(captions)} captions",
+            )
+        if origin[2] != 0:
+            raise InvalidField("", f"expected an origin without yaw, got {origin[2]} rad")
     height, width = log_odds[0].shape
     x = float(origin[0]), float(origin[0] + resolution * width)
     y = float(origin[1]), float(origin[1] + resolution * height)

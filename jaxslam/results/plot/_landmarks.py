@@ -13,8 +13,8 @@ from matplotlib.transforms import Affine2D
 from numpy.typing import ArrayLike
 
 from jaxslam.consistency.campaign import Campaign
-from jaxslam.core._validation import check_record
 from jaxslam.core.types import Estimate, Truth
+from jaxslam.core.validation import InvalidField, instance_of, refusals_of, require
 from jaxslam.results.plot._style import (
     COLORS,
     FAINT,
@@ -80,11 +80,12 @@ def ellipse(
     or indefinite.
     """
     cov = np.asarray(cov, np.float64)
-    if cov.shape != (2, 2) or not np.all(np.isfinite(cov)):
-        raise ValueError(f"ellipse: expected a finite 2×2 covariance, got {cov}")
-    contour = ellipses(np.zeros((1, 2)), cov[None], n_sigma, points)[0]
-    if np.isnan(contour).all():
-        raise ValueError(f"ellipse: expected a positive semi-definite covariance, got {cov}")
+    with refusals_of("ellipse"):
+        if cov.shape != (2, 2) or not np.all(np.isfinite(cov)):
+            raise InvalidField("", f"expected a finite 2×2 covariance, got {cov}")
+        contour = ellipses(np.zeros((1, 2)), cov[None], n_sigma, points)[0]
+        if np.isnan(contour).all():
+            raise InvalidField("", f"expected a positive semi-definite covariance, got {cov}")
     return np.asarray(np.asarray(mean) + contour)
 
 
@@ -152,9 +153,10 @@ def map_figure(
 
     Raises ValueError if names are given without true_points.
     """
-    check_record("map_figure", "the first argument", estimate, Estimate)
-    if names is not None and true_points is None:
-        raise ValueError("map_figure: names are those of true_points, which are missing")
+    with refusals_of("map_figure"):
+        require("estimate", estimate, instance_of(Estimate))
+        if names is not None and true_points is None:
+            raise InvalidField("names", "they are those of true_points, which are missing")
     if truth is not None:
         true_path, true_points = np.asarray(truth.pose), np.asarray(truth.landmarks)[:, :2]
     heights, tall = ((1.0,), width) if names is None else ((1.0, 0.2), 1.25 * width)
@@ -187,9 +189,10 @@ def run_map_figure(campaign: Campaign, *, title: str = "", width: float = PAGE) 
     The panels show the true map and its surroundings; estimates may leave them. Raises ValueError
     if the campaign has no run 0.
     """
-    check_record("run_map_figure", "the first argument", campaign, Campaign)
-    if not campaign.first:
-        raise ValueError("run_map_figure: the campaign holds no run 0 (Campaign.first is empty)")
+    with refusals_of("run_map_figure"):
+        require("campaign", campaign, instance_of(Campaign))
+        if not campaign.first:
+            raise InvalidField("campaign", "it holds no run 0 (Campaign.first is empty)")
     if len(campaign.first) == 1:
         ((truth, estimate),) = campaign.first.values()
         return map_figure(estimate, truth=truth, title=title, width=width)
@@ -328,8 +331,8 @@ def walls_figure(
     alive = np.asarray(estimate.alive[-1])
     tags = np.asarray(estimate.tag[-1])[alive]
     if len(tags) and not (tags.min() >= 0 and tags.max() <= wall_of_segment.max()):
-        raise ValueError(
-            f"walls_figure: expected tags from 0 to {wall_of_segment.max()}, got {tags}"
+        raise InvalidField(
+            "", f"expected tags from 0 to {wall_of_segment.max()}, got {tags}", owner="walls_figure"
         )
     feet = np.asarray(estimate.points[-1])[alive]
     covs = np.asarray(estimate.point_covs[-1])[alive]

@@ -13,7 +13,7 @@ from jaxslam.consistency._measures.coverage import LEVELS
 from jaxslam.consistency._measures.errors import bound_curve
 from jaxslam.consistency._measures.nees import DOF
 from jaxslam.consistency.campaign import Campaign
-from jaxslam.core._validation import check_record
+from jaxslam.core.validation import instance_of, refusals_of, require
 from jaxslam.results.plot._panels import (
     TOGETHER,
     add_legends,
@@ -200,7 +200,8 @@ def gained_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
     the logarithmic axis, each filter at a different height. More than five filters are drawn by
     kind. width [in].
     """
-    check_record("gained_figure", "the first argument", campaign, Campaign)
+    with refusals_of("gained_figure"):
+        require("campaign", campaign, instance_of(Campaign))
     key = "rotation_information"
     curves = {name: s.curves[key] for name, s in campaign.filters.items() if key in s.curves}
     others = [name for name in campaign.filters if name not in curves]
@@ -264,7 +265,8 @@ def cost_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
     over 100 times dof is marked at the edge. Filters that were not timed have no point. width [in];
     at least that of a page for more than five filters.
     """
-    check_record("cost_figure", "the first argument", campaign, Campaign)
+    with refusals_of("cost_figure"):
+        require("campaign", campaign, instance_of(Campaign))
     times = {name: 1e6 * campaign.step_seconds.get(name, np.nan) for name in campaign.filters}
     numbers, few = numbers_of(list(times)), len(times) <= TOGETHER
     groups = [("", list(times))] if few else kinds_of(list(times))

@@ -14,7 +14,7 @@ from matplotlib.ticker import LogLocator, NullLocator
 from jaxslam.catalog import KINDS
 from jaxslam.consistency._measures.nees import DOF
 from jaxslam.consistency.campaign import Campaign
-from jaxslam.core._validation import check_record
+from jaxslam.core.validation import instance_of, refusals_of, require
 from jaxslam.results.plot._style import (
     INK,
     PAGE,
@@ -83,7 +83,8 @@ def sheet(
         only: the filters shown; default all.
         height: of a panel [in] of few filters; default by the width.
     """
-    check_record("plot", "the first argument", campaign, Campaign)
+    with refusals_of("plot"):
+        require("campaign", campaign, instance_of(Campaign))
     count = len(quantities)
     numbers = numbers_of(list(campaign.filters))
     groups = kinds_of([name for name in numbers if only is None or name in only])

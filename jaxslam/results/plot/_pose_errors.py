@@ -7,8 +7,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jaxslam.consistency.campaign import Campaign
-from jaxslam.core._validation import check_record
 from jaxslam.core.types import Estimate, Truth
+from jaxslam.core.validation import InvalidField, instance_of, refusals_of, require
 from jaxslam.results.plot._panels import common_top, mark_beyond, scale_setters
 from jaxslam.results.plot._style import (
     COLORS,
@@ -41,7 +41,8 @@ def errors_figure(
     estimate: Estimate, truth: Truth, *, title: str = "", width: float = PAGE
 ) -> Figure:
     """Errors of x, y and heading over the steps, with ±3 σ of the filter's covariance."""
-    check_record("errors_figure", "the first argument", estimate, Estimate)
+    with refusals_of("errors_figure"):
+        require("estimate", estimate, instance_of(Estimate))
     error, bound = _errors(estimate, truth)
     figure, panels = panels_of(width, 0.55 * width + 1.4, 3)
     for i, (axes, name) in enumerate(zip(panels, _QUANTITIES, strict=True)):
@@ -60,9 +61,10 @@ def run_errors_figure(campaign: Campaign, *, title: str = "", width: float = PAG
     these have a separate one, with bold numbers. Filters that do not set a scale (`rmse_figure`)
     leave the panels at an arrow. Raises ValueError if the campaign has no run 0.
     """
-    check_record("run_errors_figure", "the first argument", campaign, Campaign)
-    if not campaign.first:
-        raise ValueError("run_errors_figure: the campaign holds no run 0 (Campaign.first is empty)")
+    with refusals_of("run_errors_figure"):
+        require("campaign", campaign, instance_of(Campaign))
+        if not campaign.first:
+            raise InvalidField("campaign", "it holds no run 0 (Campaign.first is empty)")
     if len(campaign.first) == 1:
         ((truth, estimate),) = campaign.first.values()
         return errors_figure(estimate, truth, title=title, width=width)

@@ -12,10 +12,9 @@ from numpy.typing import ArrayLike
 
 from jaxslam._driver import run
 from jaxslam.consistency.campaign._candidates import cast_floats, method_of
-from jaxslam.core._numbers import check_count
-from jaxslam.core._validation import check_record
 from jaxslam.core.protocols import Candidate, Filter
 from jaxslam.core.types import Estimate, Log, Status, Trace, Truth
+from jaxslam.core.validation import InvalidField, at_least, instance_of, refusals_of, require
 from jaxslam.filters._delayed.state import DelayedState, covariance_blocks
 from jaxslam.filters._information.eif_slam import CanonicalState
 from jaxslam.filters._information.marginals import local_information
@@ -189,12 +188,12 @@ def frame_steps(
 
     Raises ValueError without a step, on a `most` below 1, or on other times.
     """
-    if steps < 1:
-        raise ValueError(f"animate: expected at least one step, got {steps}")
-    check_count("animate: frames", most)
     time = np.arange(steps, dtype=float) if time is None else np.asarray(time, float)
-    if time.shape != (steps,) or not np.isfinite(time).all() or (np.diff(time) < 0).any():
-        raise ValueError(f"animate: expected {steps} finite times that do not go back")
+    with refusals_of("animate"):
+        require("steps", steps, at_least(1))
+        require("frames", most, at_least(1))
+        if time.shape != (steps,) or not np.isfinite(time).all() or (np.diff(time) < 0).any():
+            raise InvalidField("time", f"expected {steps} finite ones that do not go back")
     if steps <= most:
         return np.arange(steps)
     if most == 1:
@@ -226,19 +225,20 @@ def history_of(trace: Trace, log: Log, frames: int = MOST) -> History:
 
     Raises ValueError on a trace that is not of one run over this log, or has no step.
     """
-    check_record("animate", "trace", trace, Trace)
-    check_record("animate", "log", log, Log)
-    path, status = np.asarray(trace.estimate.pose), np.asarray(trace.info.status)
-    if path.ndim != 2 or path.shape[1] != 3:
-        raise ValueError(
-            f"animate: expected the trace of one run, with poses (T, 3), got {path.shape}"
-        )
+    with refusals_of("animate"):
+        require("trace", trace, instance_of(Trace))
+        require("log", log, instance_of(Log))
+        path, status = np.asarray(trace.estimate.pose), np.asarray(trace.info.status)
+        if path.ndim != 2 or path.shape[1] != 3:
+            raise InvalidField("trace", f"expected that of one run, poses (T, 3), got {path.shape}")
     steps = frame_steps(len(path), frames)
     rows = np.shape(log.control)[0]
     if rows != len(path) or np.shape(log.scan.tag) != status.shape:
-        raise ValueError(
-            f"animate: expected the log of the trace, of {len(path)} steps and measurements "
-            f"{status.shape}, got {rows} steps and measurements {np.shape(log.scan.tag)}"
+        raise InvalidField(
+            "log",
+            f"expected that of the trace, of {len(path)} steps and measurements {status.shape}, "
+            f"got {rows} steps and measurements {np.shape(log.scan.tag)}",
+            owner="animate",
         )
     estimate, seen = jax.tree.map(
         lambda leaf: np.asarray(leaf)[steps], (trace.estimate, trace.probe)
@@ -526,7 +526,8 @@ def animate(
     """
     history = history_of(trace, log, frames)
     if truth is not None:
-        check_record("animate", "truth", truth, Truth)
+        with refusals_of("animate"):
+            require("truth", truth, instance_of(Truth))
         true_points, true_path = np.asarray(truth.landmarks)[:, :2], truth.pose
     scene = run_scene(
         history,
@@ -561,10 +562,12 @@ def animate_world(
         dtype: dtype of the filter, by default that of JAX.
         options: further arguments of `animate`.
     """
-    check_record("animate_world", "scenario", scenario, World)
+    with refusals_of("animate_world"):
+        require("scenario", scenario, instance_of(World))
     truth, log = cast_floats(world_of_run(scenario, key, number), dtype)
     filter_key = run_keys(key, number)[1]
-    method = method_of(candidate, truth)
+    with refusals_of("animate_world"):
+        method = method_of(candidate, truth)
     if isinstance(method, Filter):
         trace = run(method, log, scenario.pose, scenario.pose_cov, filter_key, probe=probe)
     else:

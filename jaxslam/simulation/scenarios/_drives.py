@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.core._numbers import check_count
+from jaxslam.core.validation import at_least, or_none, refusals_of, require
 from jaxslam.motion._ackermann import Ackermann
 from jaxslam.motion._increments import Increment
 from jaxslam.motion._substeps import Substeps
@@ -21,7 +21,8 @@ def explore(steps: int = 100) -> Scenario:
     Odometry σ (0.05 m, 1°) a step, ranges and bearings σ (0.1 m, 1°) up to 12 m; landmarks every
     5 m, 4 m to the left and to the right, staggered; P0 = 0. Parameters ours.
     """
-    check_count("explore: steps", steps)
+    with refusals_of("explore"):
+        require("steps", steps, at_least(1))
     along = np.arange(2.5, max(steps, 6) + 5.0, 5.0)
     left = np.stack([along, np.full_like(along, 4.0)], axis=1)
     right = np.stack([along + 2.5, np.full_like(along, -4.0)], axis=1)
@@ -78,9 +79,9 @@ def webmap(steps: int | None = None, loops: int = 2) -> Scenario:
     Raises:
         ValueError: if steps or loops is not an integer >= 1.
     """
-    check_count("webmap: loops", loops)
-    if steps is not None:
-        check_count("webmap: steps", steps)
+    with refusals_of("webmap"):
+        require("loops", loops, at_least(1))
+        require("steps", steps, or_none(at_least(1)))
     landmarks = np.array(_LANDMARKS, np.float64)
     steering, path = _drive(steps, loops)
     scans = path[_SUBSTEPS::_SUBSTEPS]

@@ -4,8 +4,8 @@ import dataclasses
 
 import numpy as np
 
-from jaxslam.core._numbers import check_count
 from jaxslam.core.protocols import Sensor
+from jaxslam.core.validation import at_least, refusals_of, require
 from jaxslam.math.stats import sigma_gate
 from jaxslam.motion._increments import Increment
 from jaxslam.motion._unicycle import Unicycle
@@ -25,7 +25,8 @@ def circle(steps: int = 2500) -> Scenario:
     arXiv:2002.00878; `published` are its program's figures over 100 runs,
     and empty where the number of steps is not theirs.
     """
-    check_count("circle: steps", steps)
+    with refusals_of("circle"):
+        require("steps", steps, at_least(1))
     v, omega = 0.25, np.deg2rad(1.5)
     radius = v / omega
     around = 2 * np.pi * np.arange(20) / 20
@@ -67,7 +68,8 @@ def cloister(steps: int = 200) -> Scenario:
     The noise is on the robot; `dataclasses.replace(…, noise_on="odometry")` gives the guide's way,
     which disturbs the estimator instead (see the errata).
     """
-    check_count("cloister: steps", steps)
+    with refusals_of("cloister"):
+        require("steps", steps, at_least(1))
     return Scenario(
         name="cloister",
         motion=Increment(np.diag([0.01, 0.02]) ** 2),
@@ -157,7 +159,8 @@ def loop_landmarks(map_seed: int) -> np.ndarray:
 
 
 def _loop(name: str, sensor: Sensor, steps: int, map_seed: int) -> Scenario:
-    check_count(f"{name}: steps", steps)
+    with refusals_of(name):
+        require("steps", steps, at_least(1))
     landmarks = loop_landmarks(map_seed)
     # The true path does not depend on the draw of the noise, so the fullest scan can be counted.
     heading = _LOOP_TURN * np.arange(steps)
@@ -188,7 +191,8 @@ def stationary(steps: int = 300) -> Scenario:
     that linearizes at each new estimate shrinks it. After Julier & Uhlmann, "A counter example to
     the theory of simultaneous localization and map building", ICRA 2001; the figures are ours.
     """
-    check_count("stationary: steps", steps)
+    with refusals_of("stationary"):
+        require("steps", steps, at_least(1))
     return Scenario(
         name="stationary",
         motion=Unicycle(np.zeros((2, 2))),

@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.core._numbers import check_count
 from jaxslam.core._record import record
+from jaxslam.core.validation import InvalidField, at_least, or_none, refusals_of, require
 from jaxslam.math._arrays import Landmark, Number, Pose
 from jaxslam.motion._unicycle import Unicycle
 from jaxslam.sensors._line import Line
@@ -143,11 +143,11 @@ def square_lines(steps: int | None = None) -> Scenario:
 
 def _lines(name: str, world: LaserWorld, steps: int | None, places: int) -> Scenario:
     controls = np.asarray(world.controls)
-    if steps is not None:
-        check_count(f"{name}: steps", steps)
-        if steps > len(controls):
-            raise ValueError(f"{name}: expected at most {len(controls)} steps, got {steps}")
-        controls = controls[:steps]
+    with refusals_of(name):
+        require("steps", steps, or_none(at_least(1)))
+        if steps is not None and steps > len(controls):
+            raise InvalidField("steps", f"expected at most {len(controls)}, got {steps}")
+    controls = controls[:steps]
     walls = from_start(world)
     return Scenario(
         name=name,

@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike
 from jaxslam.core._names import unfit_signature
 from jaxslam.core._record import set_field
 from jaxslam.core.protocols import Motion, Sensor
+from jaxslam.core.validation import InvalidField, refusals_of
 from jaxslam.graphs import Factor
 
 Claim: TypeAlias = Callable[..., ArrayLike | Sequence[ArrayLike | None]]
@@ -220,38 +221,45 @@ def plain_function(
     Raises ValueError where the length of an argument is not known.
     """
     name = name or str(getattr(call, "__name__", type(call).__name__))
-    if arguments is not None and not isinstance(arguments, Mapping):
-        raise ValueError(f"{name}: expected its arguments as {{name: entries}}, got {arguments!r}")
-    if isinstance(outputs, str):
-        raise ValueError(f"{name}: expected its outputs as a tuple of names, got {outputs!r}")
-    lengths = dict(arguments or {})
-    parameters = _parameters(call, lengths)
-    if unknown := [key for key in lengths if key not in parameters]:
-        raise ValueError(
-            f"{name}: expected arguments of {', '.join(parameters) or 'no parameter'}, got "
-            f"{', '.join(unknown)}"
-        )
-    if not parameters:
-        raise ValueError(
-            f"{name}: expected a function with a parameter to differentiate by, got none"
-        )
-    named = {p: _entries(name, p, lengths.get(p, _GLOSSARY.get(p))) for p in parameters}
-    shapes = [np.shape(table) for table in (() if states is None else states)]
-    if len(shapes) == len(parameters) and all(len(shape) == 2 for shape in shapes):
-        pairs = zip(parameters, shapes, strict=True)
-        named |= {p: _number_names(p, shape[1]) for p, shape in pairs if named[p] is None}
-    complete = {p: entries for p, entries in named.items() if entries is not None}
-    if missing := [p for p in named if p not in complete]:
-        line = ", ".join(f'"{parameter}": ("v [m/s]", "omega [rad/s]")' for parameter in missing)
-        example = f"arguments={{{line}}} in Python; in a file define a function, which has a name"
-        if name.isidentifier():
-            example = f"{name}_arguments = {{{line}}} in the file, or arguments= in Python"
-        raise ValueError(
-            f"{name}: the length of {', '.join(map(repr, missing))} is not known. Name the "
-            f"entries, each with its unit: {example}"
-        )
-    arguments_of = tuple(Argument(p, entries) for p, entries in complete.items())
-    return Function(name, call, arguments_of, tuple(outputs or ()), jacobian)
+    with refusals_of(name):
+        if arguments is not None and not isinstance(arguments, Mapping):
+            raise InvalidField("arguments", f"expected {{name: entries}}, got {arguments!r}")
+        if isinstance(outputs, str):
+            raise InvalidField("outputs", f"expected a tuple of names, got {outputs!r}")
+        lengths = dict(arguments or {})
+        parameters = _parameters(call, lengths)
+        if unknown := [key for key in lengths if key not in parameters]:
+            raise InvalidField(
+                "arguments",
+                f"expected those of {', '.join(parameters) or 'no parameter'}, got "
+                f"{', '.join(unknown)}",
+            )
+        if not parameters:
+            raise InvalidField(
+                "", "expected a function with a parameter to differentiate by, got none"
+            )
+        named = {p: _entries(p, lengths.get(p, _GLOSSARY.get(p))) for p in parameters}
+        shapes = [np.shape(table) for table in (() if states is None else states)]
+        if len(shapes) == len(parameters) and all(len(shape) == 2 for shape in shapes):
+            pairs = zip(parameters, shapes, strict=True)
+            named |= {p: _number_names(p, shape[1]) for p, shape in pairs if named[p] is None}
+        complete = {p: entries for p, entries in named.items() if entries is not None}
+        if missing := [p for p in named if p not in complete]:
+            line = ", ".join(
+                f'"{parameter}": ("v [m/s]", "omega [rad/s]")' for parameter in missing
+            )
+            example = (
+                f"arguments={{{line}}} in Python; in a file define a function, which has a name"
+            )
+            if name.isidentifier():
+                example = f"{name}_arguments = {{{line}}} in the file, or arguments= in Python"
+            raise InvalidField(
+                "",
+                f"the length of {', '.join(map(repr, missing))} is not known. Name the "
+                f"entries, each with its unit: {example}",
+            )
+        arguments_of = tuple(Argument(p, entries) for p, entries in complete.items())
+        return Function(name, call, arguments_of, tuple(outputs or ()), jacobian)
 
 
 def _parameters(call: Callable[..., object], lengths: dict[str, Sequence[str] | int]) -> list[str]:
@@ -269,22 +277,18 @@ def _parameters(call: Callable[..., object], lengths: dict[str, Sequence[str] | 
     ]
 
 
-def _entries(
-    name: str, parameter: str, entries: Sequence[str] | int | None
-) -> tuple[str, ...] | None:
+def _entries(parameter: str, entries: Sequence[str] | int | None) -> tuple[str, ...] | None:
     """The names of an argument's entries, or None where they are unknown."""
     if entries is None:
         return None
     with contextlib.suppress(TypeError):
         count = operator.index(entries)  # type: ignore[arg-type]  # also a whole number of NumPy
         if count < 0:
-            raise ValueError(f"{name}: {parameter}: expected a number of entries, got {count}")
+            raise InvalidField(parameter, f"expected a number of entries, got {count}")
         return _number_names(parameter, count)
     listed = isinstance(entries, Sequence) and not isinstance(entries, str)
     if not (isinstance(entries, Sequence) and listed and all(isinstance(e, str) for e in entries)):
-        raise ValueError(
-            f"{name}: {parameter}: expected a tuple of names or their number, got {entries!r}"
-        )
+        raise InvalidField(parameter, f"expected a tuple of names or their number, got {entries!r}")
     return tuple(entries)
 
 

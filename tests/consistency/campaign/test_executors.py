@@ -166,8 +166,14 @@ def test_an_error_of_the_code_is_not_tried_again():
 @pytest.mark.parametrize(
     ("options", "told"),
     [
-        ({"executor": 4}, "expected executor as of concurrent.futures"),
-        ({"executor": lambda: Unreliable}, "expected executor as of concurrent.futures"),
+        (
+            {"executor": 4},
+            r"monte_carlo: executor: expected one of concurrent\.futures, with a method",
+        ),
+        (
+            {"executor": lambda: Unreliable},
+            r"monte_carlo: executor: expected one of concurrent\.futures, with a method",
+        ),
         ({"executor": Unreliable(), "devices": jax.devices}, "each worker of an executor uses"),
     ],
 )

@@ -469,10 +469,16 @@ def test_wrong_filters_are_found_out(name):
     ({"block": 0}, "block"),
     ({"workers": 0}, "workers"),
     ({"devices": []}, "device"),
-    ({"key": 0}, "monte_carlo: expected a PRNG key, as jax.random.key(0), got 0"),
+    ({"key": 0}, "monte_carlo: key: expected a PRNG key, as jax.random.key(0), got 0"),
     ({"filters": {}}, "at least one, got none"),
-    ({"filters": worlds.ekf(WORLD)}, "{name: filter}, at least one, got a EkfSlam"),
-    ({"filters": {"x": 3}}, "expected x to be a Filter"),
+    (
+        {"filters": worlds.ekf(WORLD)},
+        "monte_carlo: filters: expected {name: filter}, at least one, got an EkfSlam",
+    ),
+    (
+        {"filters": {"x": 3}},
+        "monte_carlo: filter x: expected a Filter, got 3; a function of the truth",
+    ),
     ({"filters": {1: EKF}}, "filters: expected a name for each, as 'ekf', got 1"),
     ({"filters": {None: EKF}}, "expected a name for each, as 'ekf', got None"),
     ({"filters": {b"ekf": EKF}}, "expected a name for each, as 'ekf', got b'ekf'"),
@@ -481,32 +487,44 @@ def test_wrong_filters_are_found_out(name):
     ({"filters": {"x": lambda log, key: None}}, "lambda truth"),
     (
         {"filters": {"x": filters.EkfSlam}},
-        "expected x to be a filter, got the class EkfSlam: call it",
+        "monte_carlo: filter x: expected a Filter, got the class EkfSlam: call it,",
     ),
     ({"filters": {"x": filters.DeadReckoning}}, "got the class DeadReckoning: call it"),
-    ({"filters": catalog.FILTERS}, "'ekf' is a factory: call it, ekf(scenario, …)"),
-    ({"filters": {"fej": catalog.FILTERS["fej"]}}, "call it, fej(world, …)"),
+    (
+        {"filters": catalog.FILTERS},
+        "monte_carlo: filter ekf: it is a factory of (scenario, …): call it",
+    ),
+    (
+        {"filters": {"fej": catalog.FILTERS["fej"]}},
+        "monte_carlo: filter fej: it is a factory of (world, …): call it",
+    ),
     (
         {"filters": {"x": filters.EkfSlam(motion.Unicycle(np.eye(2)), WORLD.sensor, 2)}},
         "takes controls (v [m/s], omega [rad/s], dt [s]), the scenario ring gives (forward [m], ",
     ),
-    ({"filters": {"x": lambda a, b, key: None}}, "'x' is a factory: call it, x(a, b, key)"),
-    ({"filters": {"x": lambda truth: 3}}, "to return a filter or an estimator, got int"),
+    (
+        {"filters": {"x": lambda a, b, key: None}},
+        "monte_carlo: filter x: it is a factory of (a, b, key): call it",
+    ),
+    (
+        {"filters": {"x": lambda truth: 3}},
+        "monte_carlo: x: filters: expected a function of the truth to return a",
+    ),
     (
         {"filters": {"x": worlds.ekf(BESIDE)}},
-        "filter x takes measurements (ahead [m], left [m]), the scenario ring gives (range [m], ",
+        "monte_carlo: filter x: it takes measurements (ahead [m], left [m]), the",
     ),
     (
         {"filters": {"x": lambda truth: worlds.ekf(BESIDE)}},
-        "filter ekf_slam takes measurements (ahead [m]",
+        "monte_carlo: x: filter ekf_slam: it takes measurements (ahead [m], left",
     ),
     (
         {"filters": {"x": known_map(np.asarray(WORLD.landmarks)[:4])}},
-        "filter x has a map of 4 landmarks, the scenario ring has 6; a map of some of them needs",
+        "monte_carlo: filter x: it has a map of 4 landmarks, the scenario ring has",
     ),
     (
         {"filters": {"x": lambda truth: known_map(jnp.concatenate([truth.landmarks] * 2))}},
-        "filter localization has a map of 12 landmarks, the scenario ring has 6",
+        "monte_carlo: x: filter localization: it has a map of 12 landmarks, the",
     ),
     escaped=True,
 )

@@ -199,7 +199,7 @@ def test_the_entropy_of_a_map_is_that_of_its_known_cells():
     grid = grids.Grid(log_odds, np.zeros(3), np.array(0.1))
     expected = -(0.25 * np.log2(0.25) + 0.75 * np.log2(0.75))
     assert metrics.map_entropy(grid) == pytest.approx(expected, abs=1e-12)
-    with pytest.raises(ValueError, match="map_entropy: no cell"):
+    with pytest.raises(ValueError, match="map_entropy: grid: it has no known cell"):
         metrics.map_entropy(grid._replace(log_odds=0 * log_odds))
 
 
@@ -209,26 +209,41 @@ def test_the_entropy_of_a_map_is_that_of_its_known_cells():
 @refused(
     (lambda: metrics.ate(SQUARE, SQUARE[:3]), "ate: .* same length, got 5 and 3"),
     (lambda: metrics.ate(SQUARE[:, :2], SQUARE[:, :2]), r"ate: .* got shape \(5, 2\)"),
-    (lambda: metrics.ate(SQUARE, SQUARE * np.nan), "ate: expected finite .* row 0 is not"),
-    (lambda: metrics.ate(np.zeros((0, 3)), np.zeros((0, 3))), "ate: expected at least one"),
-    (lambda: metrics.ate([["a", 1, 2]], SQUARE[:1]), "ate: expected a table"),
+    (
+        lambda: metrics.ate(SQUARE, SQUARE * np.nan),
+        "ate: estimate: expected finite .* row 0 is not",
+    ),
+    (
+        lambda: metrics.ate(np.zeros((0, 3)), np.zeros((0, 3))),
+        r"ate: reference: expected at least one of poses \(x, y, θ\), got shape \(0, 3\)",
+    ),
+    (
+        lambda: metrics.ate([["a", 1, 2]], SQUARE[:1]),
+        r"ate: reference: expected a table of poses \(x, y, θ\)",
+    ),
     (lambda: metrics.relations(SQUARE), "relations: expected exactly one"),
     (lambda: metrics.relations(SQUARE, rows=1, metres=1.0), "relations: expected exactly one"),
     (lambda: metrics.relations(SQUARE, seconds=1.0), "relations: expected the stamps"),
     (lambda: metrics.relations(SQUARE, metres=0.0), "relations: expected finite spacings above 0"),
-    (lambda: metrics.relations(SQUARE, rows=1.5), "relations: expected a whole number"),
+    (
+        lambda: metrics.relations(SQUARE, rows=1.5),
+        r"relations: rows: expected a whole number, got 1\.5",
+    ),
     (
         lambda: metrics.relations(SQUARE, seconds=1.0, time=[0, 1, 0.5, 2, 3]),
-        "relations: expected stamps",
+        r"relations: time: expected stamps that do not go back, got 0\.5 in row 2",
     ),
-    (lambda: metrics.revisits(SQUARE, radius=0, apart=1), "revisits: expected numbers"),
+    (
+        lambda: metrics.revisits(SQUARE, radius=0, apart=1),
+        "revisits: radius: expected a number above 0, got 0",
+    ),
     (
         lambda: metrics.relation_errors(metrics.relations(SQUARE, rows=4), SQUARE[:3]),
-        "relation_errors: the relations are of rows up to 4, and the path has 3",
+        "relation_errors: of: of rows up to 4, and the path has 3",
     ),
     (
         lambda: metrics.relations_at_stamps([0, 1], [0], [1, 2], SQUARE[:1], tolerance=1),
-        "relations_at_stamps: expected 1",
+        r"relations_at_stamps: second: expected 1 stamps, got \(2,\)",
     ),
     (
         lambda: metrics.relations_at_stamps([3, 0, 1], [7, 0], [8, 9], SQUARE[:2], tolerance=0.5),
@@ -237,20 +252,23 @@ def test_the_entropy_of_a_map_is_that_of_its_known_cells():
     ),
     (
         lambda: metrics.relations_at_stamps([0, 1], [0], [np.nan], SQUARE[:1], tolerance=1),
-        "relations_at_stamps: expected finite stamps of relations, got nan in row 0",
+        "relations_at_stamps: second: expected finite stamps, got nan in row 0",
     ),
     (
         lambda: metrics.relations_at_stamps([0, np.inf], [0], [1], SQUARE[:1], tolerance=1),
-        "relations_at_stamps: expected finite stamps",
+        r"relations_at_stamps: time: expected finite stamps \(K,\), got \(2,\)",
     ),
     (
         lambda: metrics.relations_at_stamps([0, 1], [0], [1], SQUARE[:1], tolerance=-1),
-        "relations_at_stamps: expected a tolerance",
+        "relations_at_stamps: tolerance: expected at least 0 s, got -1",
     ),
-    (lambda: metrics.statistics([]), "statistics: expected finite"),
+    (
+        lambda: metrics.statistics([]),
+        r"statistics: values: expected finite errors \(at least 1,\), got \(0,\)",
+    ),
     (
         lambda: metrics.benchmark_figures(metrics.Errors(np.zeros(0), np.zeros(0))),
-        "statistics: expected finite errors",
+        r"statistics: values: expected finite errors \(at least 1,\), got \(0,\)",
     ),
 )
 def test_bad_input_is_refused_by_name(call):

@@ -578,13 +578,19 @@ def test_without_names_intersections_find_the_landmarks():
     (lambda: slam(gate=0), "DelayedSlam: gate: expected a probability above 0 and below 1"),
     (lambda: slam(triangulation=3), "DelayedSlam: triangulation: expected a Triangulation"),
     (lambda: slam(triangulation=triangulation.Rays), "got the class Rays: call it"),
-    (lambda: slam(stored=32), "DelayedSlam: stored: expected a StoredMeasurements, got 32"),
-    (lambda: slam(hypotheses=16), "DelayedSlam: hypotheses: expected a Hypotheses, got 16"),
+    (lambda: slam(stored=32), "DelayedSlam: stored: expected StoredMeasurements, got 32"),
+    (lambda: slam(hypotheses=16), "DelayedSlam: hypotheses: expected Hypotheses, got 16"),
     (lambda: slam(promotion=2), "DelayedSlam: promotion: expected a Promotion, got 2"),
     (lambda: slam(BEACON, triangulation=triangulation.Rays()), "one bearing"),
     (lambda: slam(triangulation=triangulation.Circles()), "one range"),
-    (lambda: triangulation.Rays(parallax=2.0), "^Rays: expected parallax in"),
-    (lambda: triangulation.Circles(angle=0.0), "^Circles: expected angle in"),
+    (
+        lambda: triangulation.Rays(parallax=2.0),
+        r"^Rays: parallax: expected an angle in \(0, π/2\), got 2\.0",
+    ),
+    (
+        lambda: triangulation.Circles(angle=0.0),
+        r"^Circles: angle: expected an angle in \(0, π/2\), got 0\.0",
+    ),
     (lambda: StoredMeasurements(capacity=0), "^StoredMeasurements: capacity"),
     (
         lambda: StoredMeasurements(spacing=-0.1),

@@ -169,6 +169,6 @@ def test_a_map_is_managed_inside_the_monitor():
     outside = Closing(Monitored(managed(life.Recency())))
     with pytest.raises(
         ValueError,
-        match=r"^Closing: expected a filter whose state is a slots.Joint, .* got monitored ekf_slam",
+        match=r"^Closing: filter: expected one whose state is a slots.Joint, .* got monitored ekf_slam",
     ):
         jax.eval_shape(outside.init, jnp.zeros(3), jnp.eye(3))

@@ -239,13 +239,16 @@ def test_merging_in_float32_and_its_gradient():
 
 
 @refused(
-    (lambda: Merging(PLAIN, 0.0), "^Merging: expected"),
-    (lambda: Merging(PLAIN, 1.0, probability=1.0), "^Merging: expected"),
+    (lambda: Merging(PLAIN, 0.0), r"^Merging: reach: expected a number above 0, got 0\.0"),
+    (
+        lambda: Merging(PLAIN, 1.0, probability=1.0),
+        "^Merging: probability: expected a number above 0",
+    ),
     (lambda: Merging(of_sensor(sensors.BearingInverseDepth(np.eye(1))), 0.5), "cannot be merged"),
     (lambda: Merging(of_sensor(sensors.Compass(np.eye(1))), 0.5), "cannot be merged"),
     (
         lambda: Merging(Poses(MOTION, SENSOR, 3), 0.5).init(np.zeros(3), np.eye(3)),
-        "^Merging: expected a filter whose state is a slots.Joint",
+        r"^Merging: filter: expected one whose state is a slots\.Joint, as of EkfSlam,",
     ),
     (lambda: closest_pair(some_joint(), EUCLIDEAN, -1.0), "reach"),
     (lambda: closest_pair(some_joint(), EUCLIDEAN, 1.0, jnp.asarray(True)), "allowed"),
@@ -330,7 +333,10 @@ def test_managers_compose_in_any_order(life, order):
 
 def test_closing_takes_times():
     for life in (None, Existence(lambda pose, landmark: True)):
-        with pytest.raises(ValueError, match=r"^Closing: expected a filter that keeps times"):
+        with pytest.raises(
+            ValueError,
+            match=r"^Closing: joint: expected that of a filter that keeps times, as EkfSlam\(…,",
+        ):
             Closing(EkfSlam(*MODELS, 4, life=life)).init(np.zeros(3), np.eye(3))
 
 

@@ -437,11 +437,11 @@ def former(joint):
         lambda: RELOCATED(
             some_joint(), charts.Euclidean(), np.arange(2), np.zeros((3, 2)), np.zeros((3, 2, 2))
         ),
-        "scans",
+        r"relocated: seen: expected shape \(2, 2\), got \(3, 2\)",
     ),
     (
         lambda: seen_points(sensors.BearingOnly(0.1 * np.eye(1)), None),
-        "expected a sensor that measures points, got bearing_only",
+        "seen_points: sensor: expected one that measures points, got bearing_only",
     ),
 )
 def test_refusals(call):

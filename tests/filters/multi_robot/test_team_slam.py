@@ -392,17 +392,26 @@ def signs():
 
 @refused(
     (lambda: TeamSlam([], 3), "at least one robot"),
-    (lambda: TeamSlam([ring()], 3), "expected a team.Robot"),
+    (lambda: TeamSlam([ring()], 3), "TeamSlam: robots: expected a Robot, got a Scenario"),
     (lambda: TeamSlam(crew(2)[::-1], 3), "expected no start of robot 0"),
-    (lambda: TeamSlam(crew(2), 3, tags=(7, 7)), "2 different tags"),
-    (lambda: TeamSlam(crew(2), 3, tags=(7,)), "2 different tags"),
+    (
+        lambda: TeamSlam(crew(2), 3, tags=(7, 7)),
+        r"TeamSlam: tags: expected 2 different ones, of the robots",
+    ),
+    (
+        lambda: TeamSlam(crew(2), 3, tags=(7,)),
+        r"TeamSlam: tags: expected 2 different ones, of the robots",
+    ),
     (lambda: TeamSlam(crew(2), 3, tags=(7, -1)), "integers >= 0"),
     (lambda: TeamSlam(crew(2), 0), "capacity"),
-    (lambda: TeamSlam(crew(2), 3, report=2), "expected report from 0 to"),
+    (lambda: TeamSlam(crew(2), 3, report=2), "report: expected a number from 0 to 1"),
     (lambda: TeamSlam(crew(2), 3, gate=0.0), "gate: expected a probability above 0 and below 1"),
     (lambda: TeamSlam(crew(2), 3, correction="at once"), "correction: expected"),
     (lambda: TeamSlam([signs()], 3), "expected landmarks \\(x, y\\)"),
-    (lambda: TeamSlam([crew(1)[0], compass_only()], 3), "robot 1 needs a start"),
+    (
+        lambda: TeamSlam([crew(1)[0], compass_only()], 3),
+        r"TeamSlam: robots\[1\]: expected a start, or a sensor that measures both",
+    ),
     (
         lambda: team.Robot(motion.Increment(Q), ring().sensor),
         "sensors: expected a Suite, got a RangeBearing",
@@ -410,7 +419,7 @@ def signs():
     (lambda: dataclasses.replace(crew(1)[0], start=((0, 0), NOTHING)), "shape"),
     (lambda: world(crew(2), tags=(3, 9)), "expected tags of robots from"),
     (lambda: world(unknown(crew(2))), "expected a start of every robot"),
-    (lambda: world(crew(2), report=2), "expected report from 0 to"),
+    (lambda: world(crew(2), report=2), "report: expected a number from 0 to 1"),
 )
 def test_bad_input(make):
     make()

@@ -359,8 +359,14 @@ def test_gradients_are_finite_from_a_start_that_is_known_exactly():
     ({"particles": 2.5}, "particles: expected an integer"),
     ({"least": 0}, "least: expected an integer"),
     ({"least": 6}, "least: expected at most particles = 5"),
-    ({"landmarks": np.zeros((3, 3))}, "ParticleLocalization: expected landmarks of shape"),
-    ({"tags": [0, 0, 1, 2, 3, 4]}, "different tags"),
+    (
+        {"landmarks": np.zeros((3, 3))},
+        r"ParticleLocalization: landmarks: expected shape \(at least 1, 2\), got \(3, 3\)",
+    ),
+    (
+        {"tags": [0, 0, 1, 2, 3, 4]},
+        "ParticleLocalization: tags: expected 6 different ones from 0 to",
+    ),
     ({"start": "anywhere"}, 'start: expected "gaussian" or "uniform"'),
     ({"start": "uniform"}, "box: expected"),
     ({"box": [[0, 0, 0], [1, 1, 1]]}, "box: expected shape"),

@@ -215,7 +215,9 @@ def test_priors_alone_and_what_is_not_determined():
         graphs.marginals(graphs.optimize(loose))
     with pytest.raises(ValueError, match="expected a Kernel"):
         graphs.optimize(alone, kernel="huber")
-    with pytest.raises(ValueError, match=r"expected fixed_pose of shape \(1,\)"):
+    with pytest.raises(
+        ValueError, match=r"graphs\.optimize: fixed_pose: expected shape \(1,\), got \(2,\)"
+    ):
         graphs.optimize(alone._replace(fixed_pose=np.zeros(2, bool)))
 
 

@@ -151,16 +151,16 @@ def test_a_bent_wall_is_found_as_often_as_the_docstring_says_and_a_straight_one_
     ({"range": np.ones(3)}, {}, "segments: expected one scan"),
     ({"angle": AROUND[::-1]}, {}, "segments: expected angles that increase"),
     ({"angle": 1.01 * AROUND}, {}, "segments: expected angles that increase within one turn"),
-    ({}, {"sigma": 0.0}, "segments: expected sigma and max_range above 0"),
+    ({}, {"sigma": 0.0}, "segments: sigma: expected a number above 0"),
     ({"range": np.full(360, 1e-300)}, {}, "fit_line: expected beams"),
-    ({}, {"least": 2}, "segments: .*least of at least 3"),
+    ({}, {"least": 2}, "segments: least: expected an integer >= 3"),
 )
 def test_bad_input_is_refused(change, options):
     segments(scan(AROUND)._replace(**change), **({"sigma": 0.1, "max_range": 9} | options))
 
 
 def test_what_is_no_scan_is_refused():
-    with pytest.raises(ValueError, match="segments: expected Beams, got str"):
+    with pytest.raises(ValueError, match="segments: beams: expected Beams, got 'x'"):
         segments("x", sigma=0.1, max_range=9)
 
 

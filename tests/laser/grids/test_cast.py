@@ -318,22 +318,37 @@ def test_what_is_off_the_map_is_not_hit():
         r"pose 0, .*, is off the map",
     ),
     (lambda g: grids.cast(g, np.array([0.1, np.nan, 0.0]), ANGLES, 1.0), "pose 0"),
-    (lambda g: grids.cast("x", np.zeros(3), ANGLES, 1.0), "cast: expected a Grid or a RayMap"),
-    (lambda g: grids.cast(g, "abc", ANGLES, 1.0), "cast: expected real numbers as pose, got abc"),
-    (lambda g: grids.cast(g, np.zeros(3), ANGLES, "3"), "cast: .* as max_range, got 3"),
+    (
+        lambda g: grids.cast("x", np.zeros(3), ANGLES, 1.0),
+        "cast: grid: expected a Grid or a RayMap, got 'x'",
+    ),
+    (lambda g: grids.cast(g, "abc", ANGLES, 1.0), "cast: pose: expected real numbers, got 'abc'"),
+    (
+        lambda g: grids.cast(g, np.zeros(3), ANGLES, "3"),
+        "cast: max_range: expected a number above 0, got '3'",
+    ),
     (
         lambda g: grids.cast(g._replace(resolution=None), np.zeros(3), ANGLES, 1.0),
-        "ray_map: expected real numbers as resolution, got None",
+        r"ray_map: grid\.resolution: expected a number above 0, got None",
     ),
     (lambda g: grids.cast(g, np.zeros(2), ANGLES, 1.0), r"expected poses \(x, y, θ\)"),
-    (lambda g: grids.cast(g, np.zeros(3), ANGLES[:0], 1.0), "expected angles of shape"),
-    (lambda g: grids.cast(g, np.zeros(3), ANGLES * np.nan, 1.0), "expected finite angles"),
-    (lambda g: grids.cast(g, np.zeros(3), ANGLES, -1.0), "expected one max_range above 0"),
+    (
+        lambda g: grids.cast(g, np.zeros(3), ANGLES[:0], 1.0),
+        r"cast: angles: expected shape \(at least 1,\), got \(0,\)",
+    ),
+    (
+        lambda g: grids.cast(g, np.zeros(3), ANGLES * np.nan, 1.0),
+        "cast: angles: expected finite numbers",
+    ),
+    (
+        lambda g: grids.cast(g, np.zeros(3), ANGLES, -1.0),
+        r"cast: max_range: expected a number above 0, got -1\.0",
+    ),
     (
         lambda g: grids.ray_map(g._replace(log_odds=np.ones((2, 2)))),
-        "ray_map: the map has no free cell",
+        r"ray_map: grid: it has no free cell \(log-odds below 0\)",
     ),
-    (lambda g: grids.ray_map(g, method="lut"), "ray_map: expected a method of surface, cells"),
+    (lambda g: grids.ray_map(g, method="lut"), 'ray_map: method: expected "surface" or "cells"'),
 )
 def test_bad_input_is_refused(call):
     call(grid_of(np.full((5, 6), -1.0)))

@@ -240,19 +240,22 @@ def test_a_log_of_beams_drops_what_says_nothing():
 @refused(
     (
         lambda: grids.GridLocalization(GRID._replace(log_odds=abs(GRID.log_odds)), MODEL, MOVE, 9),
-        "GridLocalization: the map has no free cell",
+        r"GridLocalization: grid: it has no free cell \(log-odds below 0\)",
     ),
     (
         lambda: of(box=[[50, 50], [51, 51]]),
-        "GridLocalization: no free cell of the map is in the box",
+        r"GridLocalization: box: no free cell of the map is in \[\[50\.0, 50\.0\], \[51\.0,",
     ),
     (lambda: of(box=[[1, 1], [0, 0]]), "GridLocalization: box: expected"),
-    (lambda: of(exponent=0.0), "GridLocalization: expected exponent above 0"),
+    (lambda: of(exponent=0.0), r"GridLocalization: exponent: expected a number above 0, got 0\.0"),
     (lambda: of(stride=0), "GridLocalization: stride"),
     (lambda: of(0), "GridLocalization: particles"),
     (lambda: of(start="somewhere"), "GridLocalization: start: expected"),
     (lambda: of(forget=(1, 0.1)), "GridLocalization: forget: expected"),
-    (lambda: grids.GridLocalization(3, MODEL, MOVE, 9), "GridLocalization: expected a Grid"),
+    (
+        lambda: grids.GridLocalization(3, MODEL, MOVE, 9),
+        "GridLocalization: grid: expected a Grid, got 3",
+    ),
     (
         lambda: grids.GridLocalization(GRID, MOVE, MODEL, 9),
         "GridLocalization: model: expected a BeamModel",
@@ -261,20 +264,23 @@ def test_a_log_of_beams_drops_what_says_nothing():
         lambda: grids.beam_log(
             np.zeros((2, 3)), Beams(*np.zeros((2, 2, 4)), np.zeros((2, 4), bool))
         ),
-        "beam_log: none of 2 scans has a valid beam",
+        "beam_log: beams: none of 2 scans has a valid beam",
     ),
     (
         lambda: grids.beam_log(np.zeros((3, 3)), Beams(*np.ones((2, 2, 4)), np.ones((2, 4), bool))),
-        "beam_log: expected a control .* for each of 2 scans",
+        r"beam_log: control: expected one \(U,\) for each of 2 scans, got \(3, 3\)",
     ),
     (
         lambda: grids.beam_log(
             np.zeros((2, 3)), Beams(np.ones((2, 4)), np.ones(4), np.ones(4, bool))
         ),
-        "beam_log: expected as many ranges",
+        r"beam_log: beams: expected as many ranges, angles and masks \(T, B\), got \(2,",
     ),
     (lambda: grids.clusters(np.zeros((3, 3)), np.full(3, -np.inf)), "clusters: no particle"),
-    (lambda: grids.clusters(np.zeros((3, 2)), np.zeros(3)), "clusters: expected poses"),
+    (
+        lambda: grids.clusters(np.zeros((3, 2)), np.zeros(3)),
+        r"clusters: pose: expected poses \(P, 3\) and weights \(P,\), got \(3, 2\), \(3,\)",
+    ),
     (
         lambda: motion.odometry_controls(np.zeros(3)),
         "odometry_controls: path: expected finite poses",
@@ -282,11 +288,17 @@ def test_a_log_of_beams_drops_what_says_nothing():
     (lambda: consistency.judge_localization(WORLD, of(), 0, KEY), "judge_localization: runs"),
     (
         lambda: consistency.judge_localization(WORLD, of(), 1, KEY, stride=61),
-        "judge_localization: expected stride <= 60 steps, got 61",
+        "judge_localization: stride: expected at most the 60 steps, got 61",
     ),
-    (lambda: consistency.judge_localization(WORLD, 3, 1, KEY), "expected a Filter, got int"),
-    (lambda: consistency.judge_localization(3, of(), 1, KEY), "localization: expected a Laser"),
-    (lambda: scan_world(ROOM, KEY), "scan_world: expected a LaserWorld, got Walls"),
+    (
+        lambda: consistency.judge_localization(WORLD, 3, 1, KEY),
+        "judge_localization: filter: expected a Filter, got 3",
+    ),
+    (
+        lambda: consistency.judge_localization(3, of(), 1, KEY),
+        "judge_localization: world: expected a LaserWorld, got 3",
+    ),
+    (lambda: scan_world(ROOM, KEY), "scan_world: world: expected a LaserWorld, got Walls"),
 )
 def test_bad_input_is_refused(call):
     call()

@@ -123,15 +123,18 @@ def test_a_map_of_a_square_room_is_that_room():
 
 
 @refused(
-    (lambda p, b: (p[:3], b), "count: expected a pose .* for each of 20 scans"),
-    (lambda p, b: (p, b._replace(angle=b.angle[:, :4])), "count: expected as many ranges, angles"),
-    (lambda p, b: (p, None), "count: expected Beams, got NoneType"),
+    (lambda p, b: (p[:3], b), "count: poses: expected one .* for each of 20 scans"),
+    (
+        lambda p, b: (p, b._replace(angle=b.angle[:, :4])),
+        "count: beams: expected as many ranges, angles",
+    ),
+    (lambda p, b: (p, None), "count: beams: expected Beams, got None"),
     (
         lambda p, b: (p, b._replace(range=b.range.tolist())),
-        "count: expected ranges, angles and masks in arrays, got list, ndarray, ndarray",
+        "count: beams: expected ranges, angles and masks in arrays, got list, ndarray, ndarray",
     ),
-    (lambda p, b: (p, b._replace(valid=b.valid & False)), "count: no scan has a valid beam"),
-    (lambda p, b: (p * np.nan, b), "count: expected finite poses"),
+    (lambda p, b: (p, b._replace(valid=b.valid & False)), "count: beams: no scan has a valid beam"),
+    (lambda p, b: (p * np.nan, b), "count: poses: expected finite numbers"),
 )
 def test_bad_scans_are_refused(change):
     counted(*change(*scans()))
@@ -144,7 +147,7 @@ def test_a_beam_of_no_angle_is_unusable():
     valid[4, 2:6] = False
     same = counted(poses, beams._replace(valid=valid))
     jax.tree.map(np.testing.assert_array_equal, counted(poses, beams._replace(angle=angle)), same)
-    with pytest.raises(ValueError, match="count: no scan has a valid beam"):
+    with pytest.raises(ValueError, match="count: beams: no scan has a valid beam"):
         counted(poses, beams._replace(angle=angle * np.nan))
 
 
@@ -165,18 +168,18 @@ def of_window(shape=SHAPE, origin=ORIGIN, cell=CELL, max_range=1.0):
 
 
 @refused(
-    (lambda: of_window(max_range=0.0), "count: expected max_range above 0"),
-    (lambda: of_window(max_range=np.inf), "count: expected max_range above 0"),
-    (lambda: of_window(max_range=np.nan), "count: expected max_range above 0"),
-    (lambda: of_window((0, 5)), r"count: expected a shape \(H, W\)"),
-    (lambda: of_window((5.0, 5)), r"count: expected a shape \(H, W\)"),
-    (lambda: of_window((5,)), r"count: expected a shape \(H, W\)"),
-    (lambda: counted(*scans(), mount=(0.0, 0.0)), "count: expected a mounting pose"),
-    (lambda: of_window(cell=0.0), "count: expected a resolution above 0"),
-    (lambda: of_window(origin=ORIGIN[:2]), "count: expected an origin"),
-    (lambda: counted(*scans(), free=3.0), r"count: expected no_return from 0 to 2\.5"),
+    (lambda: of_window(max_range=0.0), "count: max_range: expected a number above 0"),
+    (lambda: of_window(max_range=np.inf), "count: max_range: expected a number above 0"),
+    (lambda: of_window(max_range=np.nan), "count: max_range: expected a number above 0"),
+    (lambda: of_window((0, 5)), r"count: shape: expected \(H, W\)"),
+    (lambda: of_window((5.0, 5)), r"count: shape: expected \(H, W\)"),
+    (lambda: of_window((5,)), r"count: shape: expected \(H, W\)"),
+    (lambda: counted(*scans(), mount=(0.0, 0.0)), "count: mount: expected a mounting pose"),
+    (lambda: of_window(cell=0.0), "count: resolution: expected a number above 0"),
+    (lambda: of_window(origin=ORIGIN[:2]), "count: origin: expected finite"),
+    (lambda: counted(*scans(), free=3.0), r"count: no_return: expected a number from 0 to 2\.5"),
     (lambda: grids.occupancy(counted(*scans()), hit=0.4), "occupancy: expected 0 < miss"),
-    (lambda: grids.reflection(counted(*scans()), prior=0.0), "reflection: expected a prior"),
+    (lambda: grids.reflection(counted(*scans()), prior=0.0), "reflection: prior: expected"),
 )
 def test_bad_numbers_are_refused(call):
     call()

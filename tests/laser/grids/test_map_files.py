@@ -215,12 +215,27 @@ def test_what_cannot_be_written_is_refused_and_nothing_is_left(tmp_path):
     grid = datasets.read_map(made(tmp_path))
     for path, wrong, mode, reason in [
         ("a.yaml", grid._replace(log_odds=np.full((2, 2), np.nan)), "trinary", "unknown is 0"),
-        ("a.yaml", grid._replace(log_odds=np.zeros((0, 2))), "trinary", "expected log-odds"),
-        ("a.yaml", grid._replace(origin=np.zeros(2)), "trinary", "an origin that is a pose"),
-        ("a.yaml", grid._replace(resolution=0.0), "trinary", "a resolution above 0"),
+        (
+            "a.yaml",
+            grid._replace(log_odds=np.zeros((0, 2))),
+            "trinary",
+            "log_odds: expected at least one cell",
+        ),
+        (
+            "a.yaml",
+            grid._replace(origin=np.zeros(2)),
+            "trinary",
+            r"origin: expected finite numbers of shape \(3,\)",
+        ),
+        (
+            "a.yaml",
+            grid._replace(resolution=0.0),
+            "trinary",
+            "resolution: expected a number above 0",
+        ),
         ("a.yaml", "grid", "trinary", "expected a Grid"),
-        ("a.yaml", grid, "raw", "expected mode"),
-        ("a.pgm", grid, "trinary", "expected a path NAME.yaml"),
+        ("a.yaml", grid, "raw", "mode: expected"),
+        ("a.pgm", grid, "trinary", "path: expected NAME.yaml"),
     ]:
         with pytest.raises(ValueError, match=f"write_map: .*{reason}"):
             datasets.write_map(tmp_path / "new" / path, wrong, mode=mode)

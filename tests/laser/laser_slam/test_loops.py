@@ -215,7 +215,7 @@ def test_scans_that_are_none_are_refused(drive):
         ([0], [40], "expected scans from 0 to 39, got 40 to 40"),
         ([-1], [1], "expected scans from 0 to 39, got -1"),
     ):
-        with pytest.raises(ValueError, match=f"relation_covs: {message}"):
+        with pytest.raises(ValueError, match=f"relation_covs: first, second: {message}"):
             laser_slam.relation_covs(solved, first, second)
     assert laser_slam.relation_covs(solved, [0, 3], [0, 3]).max() == 0
     assert laser_slam.relation_covs(solved, np.zeros(0, int), np.zeros(0, int)).shape == (0, 3, 3)

@@ -175,13 +175,15 @@ def test_points_are_in_the_robots_frame():
 )
 def test_a_mount_that_is_none_is_refused(mount):
     _, log = driven(scans=3)
-    with pytest.raises(ValueError, match="here: expected a mount of three finite numbers, got"):
-        _scan_points.check_laser_log("here", log._replace(mount=mount))
+    with pytest.raises(ValueError, match=r"mount: expected finite numbers of shape \(3,\), got"):
+        _scan_points.laser_log(log._replace(mount=mount))
 
 
 def test_a_mask_of_odometry_of_another_size_is_refused():
     _, log = driven(scans=3)
-    _scan_points.check_laser_log("here", log._replace(odometry_known=np.ones(3, bool)))
+    _scan_points.laser_log(log._replace(odometry_known=np.ones(3, bool)))
     for mask in (np.ones(2, bool), np.ones((3, 1), bool), True):
-        with pytest.raises(ValueError, match="here: expected odometry_known of each of 3 scans"):
-            _scan_points.check_laser_log("here", log._replace(odometry_known=mask))
+        with pytest.raises(
+            ValueError, match=r"odometry_known: expected shape \(3,\), as of the scans"
+        ):
+            _scan_points.laser_log(log._replace(odometry_known=mask))

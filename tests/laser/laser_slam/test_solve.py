@@ -70,7 +70,9 @@ def test_a_filter_is_driven_by_the_matches(drive):
         cov = _end_covariances.composed_cov(cov, odometry.z[key], odometry.cov[key])
         expected = _end_covariances.of_coordinates(cov, odometry.poses[key])
         np.testing.assert_allclose(path.pose_cov[row], expected, rtol=1e-9, atol=1e-15)
-    with pytest.raises(ValueError, match="match_controls: expected Odometry or Solved, got int"):
+    with pytest.raises(
+        ValueError, match="match_controls: of: expected Odometry or Solved, got int"
+    ):
         laser_slam.match_controls(1)
 
 
@@ -208,12 +210,24 @@ def test_a_log_of_maximum_ranges_is_raw_odometry(drive):
 
 
 @refused(
-    (lambda log: {"raw": log.raw[:3]}, "raw odometry"),
-    (lambda log: {"time": log.time[:3]}, "times"),
+    (
+        lambda log: {"raw": log.raw[:3]},
+        r"laser_slam\.solve: log\.raw: expected shape \(40, 3\), as of the scans",
+    ),
+    (
+        lambda log: {"time": log.time[:3]},
+        r"laser_slam\.solve: log\.time: expected shape \(40,\), as of the scans, got \(3,\)",
+    ),
     (lambda log: {"max_range": 0.0}, "max_range"),
     (lambda log: {"beams": log.beams._replace(angle=log.beams.angle[:, :3])}, "angles"),
-    (lambda log: {"beams": log.beams._replace(range=np.zeros((0, 3)))}, "ranges"),
-    (lambda log: {"raw": log.raw * np.nan}, "raw odometry of scan 0 is not finite"),
+    (
+        lambda log: {"beams": log.beams._replace(range=np.zeros((0, 3)))},
+        r"laser_slam\.solve: log\.beams\.range: expected \(scans, beams\), at least one,",
+    ),
+    (
+        lambda log: {"raw": log.raw * np.nan},
+        r"laser_slam\.solve: log\.raw: the odometry of scan 0 is not finite",
+    ),
     (
         lambda log: {"time": np.where(log.time == 3, np.nan, log.time)},
         "the time of scan 3 is not finite",
@@ -325,7 +339,7 @@ def test_the_command_scores_it_by_relations(drive, monkeypatch, tmp_path, capsys
         for path, at in (
             ("laser SLAM", solved.poses),
             ("laser odometry", solved.odometry),
-            ("raw odometry", solved.raw),
+            (r"laser_slam\.solve: log\.raw: expected shape \(40, 3\), as of the scans", solved.raw),
         ):
             errors = metrics.relation_errors(some, at)
             expected = metrics.benchmark_figures(errors)

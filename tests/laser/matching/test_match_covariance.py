@@ -209,9 +209,9 @@ def test_the_jacobian_of_the_field_is_that_of_autodiff():
 
 
 @refused(
-    (lambda: covariance.Implicit(0.0), "Implicit: expected sigma above 0"),
+    (lambda: covariance.Implicit(0.0), "Implicit: sigma: expected a number above 0"),
     (lambda: covariance.Lattice(0.1, steps=1), "Lattice: steps: expected an integer >= 3"),
-    (lambda: covariance.Unscented(0.1, np.eye(2)), "Unscented: expected a covariance"),
+    (lambda: covariance.Unscented(0.1, np.eye(2)), "Unscented: start_cov: expected a covariance"),
     (lambda: covariance.Sampling(0.1, np.eye(3), 0), "Sampling: samples: expected"),
 )
 def test_bad_input_is_refused(call):

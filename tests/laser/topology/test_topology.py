@@ -133,13 +133,16 @@ def test_places_of_a_path_cover_it_and_a_loop_connects_its_ends():
 
 @refused(
     (lambda: topology.skeleton(drawn("###")), "skeleton: no free cell"),
-    (lambda: topology.skeleton(drawn("..."), clearance=0), "skeleton: expected a clearance"),
-    (lambda: topology.topological_map(drawn("..."), max_width=0), "topological_map: expected"),
-    (lambda: topology.route(places(), [-9, 0], ROOMS[0]), "route: the start .* is in no place"),
+    (lambda: topology.skeleton(drawn("..."), clearance=0), "skeleton: clearance: expected"),
+    (
+        lambda: topology.topological_map(drawn("..."), max_width=0),
+        "topological_map: max_width: expected",
+    ),
+    (lambda: topology.route(places(), [-9, 0], ROOMS[0]), "route: start: .* is in no place"),
     (lambda: topology.place_weights(places(), np.zeros((2, 3)), [0.0]), "place_weights: exp"),
     (lambda: topology.place_weights(places(), np.zeros((1, 3)), [-np.inf]), "of weight above 0"),
-    (lambda: topology.path_places([[0, 0]], [[0, 1]], radius=1), "path_places: expected pairs"),
-    (lambda: topology.path_places([[0, 0]], [], radius=0), "path_places: expected poses"),
+    (lambda: topology.path_places([[0, 0]], [[0, 1]], radius=1), "path_places: pairs: expected"),
+    (lambda: topology.path_places([[0, 0]], [], radius=0), "path_places: radius: expected"),
 )
 def test_bad_input_is_refused(call):
     call()

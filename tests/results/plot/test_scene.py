@@ -290,16 +290,18 @@ def test_arrays_that_do_not_belong_together_are_refused():
         with pytest.raises(ValueError, match=message):
             plot.animate(*arguments, **more)
     nothing = jax.tree.map(lambda leaf: leaf[:0], (trace, log))
-    with pytest.raises(ValueError, match="animate: expected at least one step, got 0"):
+    with pytest.raises(ValueError, match="animate: steps: expected an integer >= 1, got 0"):
         plot.animate(*nothing)
     batch = jax.tree.map(lambda leaf: leaf[None], trace)
     with pytest.raises(
-        ValueError, match=r"the trace of one run, with poses \(T, 3\), got \(1, 3, 3\)"
+        ValueError, match=r"trace: expected that of one run, poses \(T, 3\), got \(1, 3, 3\)"
     ):
         plot.animate(batch, log)
     scene, *_ = scene_of()
     for more in ({"fps": 0}, {"width": -1.0}):
-        with pytest.raises(ValueError, match=f"Film: expected {next(iter(more))} above 0"):
+        with pytest.raises(
+            ValueError, match=f"Film: {next(iter(more))}: expected a number above 0"
+        ):
             plot.Film(scene, **more)
 
 

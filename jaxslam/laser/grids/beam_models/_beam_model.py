@@ -7,10 +7,18 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, PyTree
 
-from jaxslam.core._numbers import check_count, check_mount, held_array, is_concrete, shape_text
-from jaxslam.core._record import set_field
+from jaxslam.core._numbers import is_concrete
+from jaxslam.core._reprs import shape_text
 from jaxslam.core.protocols import Component
 from jaxslam.core.types import Beams, JaxOrNumPy
+from jaxslam.core.validation import (
+    InvalidField,
+    at_least,
+    finite,
+    instance_of,
+    refusals_of,
+    require,
+)
 from jaxslam.laser.grids._grid import Grid
 from jaxslam.math import se2
 from jaxslam.math._arrays import Number
@@ -43,13 +51,6 @@ class BeamModel(Component):
         return se2.compose(pose, jnp.asarray(self.mount, pose.dtype))
 
 
-def hold_mount(model: BeamModel) -> None:
-    """Check and hold the field mount, in `__post_init__`."""
-    if model.mount is not None:
-        check_mount(type(model).__name__, model.mount)
-        set_field(model, "mount", held_array(model.mount))
-
-
 def log_likelihood(
     model: BeamModel,
     prepared: PyTree,
@@ -67,21 +68,18 @@ def log_likelihood(
     the likelihood; both make it wider. Differentiable by pose and exponent; `jax.vmap` it over
     poses.
 
-    Raises ValueError on beams that `_check_beams` refuses, a pose that is not (3,), stride below 1,
+    Raises ValueError on beams that are not one scan, a pose that is not (3,), stride below 1,
     an exponent below 0, and a grid in place of the result of `model.prepare`.
     """
-    _check_beams("log_likelihood", beams)
-    if np.shape(pose) != (3,):
-        raise ValueError(f"log_likelihood: expected a pose (x, y, θ), got {shape_text(pose)}")
-    if is_concrete(pose) and not np.all(np.isfinite(np.asarray(pose))):
-        raise ValueError(f"log_likelihood: expected a finite pose, got {pose!r}")
-    if is_concrete(exponent) and not np.all(np.asarray(exponent) >= 0):
-        raise ValueError(f"log_likelihood: expected an exponent >= 0, got {exponent!r}")
-    check_count("log_likelihood: stride", stride)
-    if isinstance(prepared, Grid):
-        raise ValueError(
-            "log_likelihood: expected what model.prepare makes of the grid, got the Grid itself"
-        )
+    with refusals_of("log_likelihood"):
+        require("beams", beams, _one_scan)
+        require("pose", pose, finite(3))
+        if is_concrete(exponent) and not np.all(np.asarray(exponent) >= 0):
+            raise InvalidField("exponent", f"expected a number >= 0, got {exponent!r}")
+        require("stride", stride, at_least(1))
+        if isinstance(prepared, Grid):
+            reason = "expected what model.prepare makes of the grid, got the Grid itself"
+            raise InvalidField("prepared", reason)
     beams = Beams(*(jnp.asarray(part)[::stride] for part in beams))
     usable = usable_beams(beams)
     # A harmless range and angle where a beam has no information: its derivative must be finite.
@@ -98,22 +96,22 @@ def usable_beams(beams: Beams) -> Bool[JaxOrNumPy, "*n"]:
     return met | free
 
 
-def _check_beams(name: str, beams: object) -> None:
-    """Raise ValueError, which begins with a caller's name, unless beams are one scan.
+def _one_scan(value: Any) -> Beams:
+    """The check of the beams of one scan.
 
     Ranges, angles and masks must have the same length; outside a trace at least one beam must be
     usable, and the angles of valid beams finite.
     """
-    if not isinstance(beams, Beams):
-        raise ValueError(f"{name}: expected Beams, got {type(beams).__name__}")
+    beams: Beams = instance_of(Beams)(value)
     shapes = [np.shape(part) for part in beams]
     if len(shapes[0]) != 1 or len(set(shapes)) != 1:
         listed = ", ".join(shape_text(part) for part in beams)
-        raise ValueError(f"{name}: expected as many ranges, angles and masks, got {listed}")
+        raise ValueError(f"expected as many ranges, angles and masks, got {listed}")
     if not is_concrete(beams):
-        return
+        return beams
     valid = np.asarray(beams.valid) & (np.asarray(beams.range) > 0)
     if not np.all(np.isfinite(np.asarray(beams.angle)[valid])):
-        raise ValueError(f"{name}: expected finite angles of valid beams")
+        raise ValueError("expected finite angles of valid beams")
     if not np.any(valid):
-        raise ValueError(f"{name}: the scan of {shapes[0][0]} beams has no valid beam")
+        raise ValueError(f"the scan of {shapes[0][0]} beams has no valid beam")
+    return beams

@@ -7,12 +7,12 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, PyTree
 
-from jaxslam.core._numbers import check_positive
-from jaxslam.core._record import record, static
+from jaxslam.core._record import field, record, static
 from jaxslam.core.types import Beams, JaxOrNumPy
+from jaxslam.core.validation import mounting_pose, or_none, positive
 from jaxslam.laser.grids._distance import distance_field
 from jaxslam.laser.grids._grid import Field, Grid, interpolate, slope
-from jaxslam.laser.grids.beam_models._beam_model import BeamModel, hold_mount
+from jaxslam.laser.grids.beam_models._beam_model import BeamModel
 from jaxslam.laser.grids.beam_models._ray_cast import check_weights
 from jaxslam.math._arrays import Number
 
@@ -32,10 +32,10 @@ class LikelihoodField(BeamModel):
     Raises ValueError on numbers out of range, or an invalid mount.
     """
 
-    sigma: Number = 0.1
+    sigma: Number = field(default=0.1, check=positive)
     """[m]"""
     _: dataclasses.KW_ONLY
-    max_range: Number
+    max_range: Number = field(check=positive)
     """[m]"""
     hit: Number = 0.9
     """weight of beams that end near an obstacle of the map"""
@@ -43,17 +43,13 @@ class LikelihoodField(BeamModel):
     """weight of beams that end anywhere"""
     maximum: Number = 0.0
     """weight of beams of max_range; the three have sum 1"""
-    truncate: float | None = static(default=2.0)
+    truncate: float | None = static(default=2.0, check=or_none(positive))
     """largest distance [m], None for no limit"""
-    mount: ArrayLike | None = None
+    mount: ArrayLike | None = field(default=None, check=or_none(mounting_pose))
     """(3,) pose of the laser on the robot"""
 
     def __post_init__(self) -> None:
-        name, hit, random = type(self).__name__, self.hit, self.random
-        check_positive(name, sigma=self.sigma, max_range=self.max_range)
-        check_weights(name, {"hit": hit, "random": random, "maximum": self.maximum})
-        check_positive(name, **({} if self.truncate is None else {"truncate": self.truncate}))
-        hold_mount(self)
+        check_weights({"hit": self.hit, "random": self.random, "maximum": self.maximum})
         super().__post_init__()
 
     def prepare(self, grid: Grid) -> Field:

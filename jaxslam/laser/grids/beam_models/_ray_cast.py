@@ -4,7 +4,7 @@ fit of its parameters to measured ranges.
 
 import dataclasses
 import math
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,12 +13,22 @@ from jax.scipy.special import ndtr
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, PyTree
 
-from jaxslam.core._numbers import check_positive, is_concrete
-from jaxslam.core._record import record, static
+from jaxslam.core._numbers import is_concrete
+from jaxslam.core._record import field, record, static
 from jaxslam.core.types import Beams
+from jaxslam.core.validation import (
+    InvalidField,
+    instance_of,
+    mounting_pose,
+    one_of,
+    or_none,
+    positive,
+    refusals_of,
+    require,
+)
 from jaxslam.laser.grids._grid import Grid
-from jaxslam.laser.grids._rays import RayMap, cast, check_method, ray_map
-from jaxslam.laser.grids.beam_models._beam_model import BeamModel, hold_mount
+from jaxslam.laser.grids._rays import METHODS, RayMap, cast, ray_map
+from jaxslam.laser.grids.beam_models._beam_model import BeamModel
 from jaxslam.math._arrays import Number
 
 
@@ -95,6 +105,25 @@ def _density_slope(
     return jnp.where(has_slope, rise / jnp.where(near > 0, near, 1.0), 0.0)
 
 
+def check_weights(weights: dict[str, ArrayLike]) -> None:
+    """Raise InvalidField unless the shares of a mixture are >= 0 and have sum 1."""
+    if not is_concrete(weights):
+        return
+    values = np.array([float(np.asarray(value)) for value in weights.values()])
+    if np.any(values < 0) or not abs(values.sum() - 1) < 1e-6:
+        listed = ", ".join(f"{key} {value:g}" for key, value in zip(weights, values, strict=True))
+        raise InvalidField("", f"expected shares >= 0 of sum 1, got {listed}")
+
+
+def _mixture_of_shares(value: Any) -> Mixture:
+    """The check of a mixture: shares of sum 1, and a deviation and a rate above 0."""
+    mixture: Mixture = instance_of(Mixture)(value)
+    require("sigma", mixture.sigma, positive)
+    require("rate", mixture.rate, positive)
+    check_weights(dict(zip(Mixture._fields[:4], mixture[:4], strict=True)))
+    return mixture
+
+
 @record
 class RayCast(BeamModel):
     """The ray-cast model: `mixture_log_density` of each range given that of `grids.cast`.
@@ -104,24 +133,15 @@ class RayCast(BeamModel):
     Raises ValueError on numbers out of range, an unknown method, an invalid mount.
     """
 
-    mixture: Mixture = _USUAL
+    mixture: Mixture = field(default=_USUAL, check=_mixture_of_shares)
     """parameters, which `fit` learns from data; the four shares have sum 1"""
     _: dataclasses.KW_ONLY
-    max_range: Number
+    max_range: Number = field(check=positive)
     """[m]"""
-    method: str | None = static(default=None)
+    method: str | None = static(default=None, check=or_none(one_of(*METHODS)))
     """of `ray_map`; None chooses by the map"""
-    mount: ArrayLike | None = None
+    mount: ArrayLike | None = field(default=None, check=or_none(mounting_pose))
     """(3,) pose of the laser on the robot"""
-
-    def __post_init__(self) -> None:
-        name, mixture = type(self).__name__, self.mixture
-        check_positive(name, max_range=self.max_range, sigma=mixture.sigma, rate=mixture.rate)
-        if self.method is not None:
-            check_method(name, self.method)
-        hold_mount(self)
-        check_weights(name, dict(zip(Mixture._fields[:4], mixture[:4], strict=True)))
-        super().__post_init__()
 
     def prepare(self, grid: Grid) -> RayMap:
         return ray_map(grid, method=self.method)
@@ -143,16 +163,6 @@ class RayCast(BeamModel):
 
     def _expected_range(self, rays: PyTree, pose: Array, beams: Beams) -> Float[Array, "B"]:
         return cast(rays, self.frame(pose), beams.angle, self.max_range)
-
-
-def check_weights(name: str, weights: dict[str, ArrayLike]) -> None:
-    """Raise ValueError unless the shares of a mixture are >= 0 and have sum 1."""
-    if not is_concrete(weights):
-        return
-    values = np.array([float(np.asarray(value)) for value in weights.values()])
-    if np.any(values < 0) or not abs(values.sum() - 1) < 1e-6:
-        listed = ", ".join(f"{key} {value:g}" for key, value in zip(weights, values, strict=True))
-        raise ValueError(f"{name}: expected shares >= 0 of sum 1, got {listed}")
 
 
 START = Mixture(0.6, 0.15, 0.1, 0.15, 0.2, 0.5)
@@ -184,21 +194,23 @@ def fit(
     range with information, an invalid start, and a max_range that is not above 0.
     """
     ranges, stars = np.asarray(z, np.float64), np.asarray(expected, np.float64)
-    if ranges.ndim != 1 or ranges.shape != stars.shape or len(ranges) == 0:
-        raise ValueError(
-            "fit: expected at least one range, and as many as expected ones, got "
-            f"{ranges.shape} and {stars.shape}"
+    with refusals_of("fit"):
+        if ranges.ndim != 1 or ranges.shape != stars.shape or len(ranges) == 0:
+            raise InvalidField(
+                "z",
+                "expected at least one range, and as many as expected ones, got "
+                f"{ranges.shape} and {stars.shape}",
+            )
+        require("start", start, _mixture_of_shares)
+        require("max_range", max_range, positive)
+        if not np.all(np.isfinite(stars)) or stars.min() < 0:
+            raise InvalidField("expected", "expected ranges that are finite and not below 0")
+        met, far = Beams(ranges, np.zeros_like(ranges), np.ones(len(ranges), bool)).returns(
+            max_range
         )
-    check_positive("fit: start", sigma=start.sigma, rate=start.rate)
-    check_weights("fit: start", dict(zip(Mixture._fields[:4], start[:4], strict=True)))
-    check_positive("fit", max_range=max_range)
-    if not np.all(np.isfinite(stars)) or stars.min() < 0:
-        raise ValueError("fit: expected predicted ranges that are finite and not below 0")
-    met, far = Beams(ranges, np.zeros_like(ranges), np.ones(len(ranges), bool)).returns(max_range)
-    if not (met | far).any():
-        raise ValueError(f"fit: none of {len(ranges)} ranges is above 0")
-    if method not in ("gradient", "em"):
-        raise ValueError(f'fit: expected method "gradient" or "em", got {method!r}')
+        if not (met | far).any():
+            raise InvalidField("z", f"none of {len(ranges)} ranges is above 0")
+        require("method", method, one_of("gradient", "em"))
     ranges = np.where(far, max_range, ranges)[met | far]
     stars = np.minimum(stars, max_range)[met | far]
     if method == "em":

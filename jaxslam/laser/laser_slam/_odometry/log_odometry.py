@@ -12,6 +12,7 @@ from jaxtyping import Float, Int
 
 from jaxslam.core._record import record
 from jaxslam.core.protocols import Motion
+from jaxslam.core.validation import InvalidField
 from jaxslam.laser.laser_slam._odometry.raw import Steps
 from jaxslam.laser.laser_slam._odometry.reference import match, reference_of, rows_of
 from jaxslam.laser.laser_slam._odometry.tracking import (
@@ -73,7 +74,9 @@ def match_controls(of: Odometry | Solved) -> Float[np.ndarray, "N 9"]:
         steps = of.graph.tables["relative_pose"]
         z, cov = np.asarray(steps.z), np.linalg.inv(np.asarray(steps.information, np.float64))
     else:
-        raise ValueError(f"match_controls: expected Odometry or Solved, got {type(of).__name__}")
+        raise InvalidField(
+            "of", f"expected Odometry or Solved, got {type(of).__name__}", owner="match_controls"
+        )
     controls = np.zeros((len(of.keyframe), 9))
     controls[1:, :3] = z
     # Row by row: xx, yx, yy, tx, ty, tt, as `MatchMotion` reads them.

@@ -12,8 +12,14 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from jaxslam.core._numbers import check_count, check_positive
-from jaxslam.core._record import record, static
+from jaxslam.core._record import field, record, static
+from jaxslam.core.validation import (
+    at_least,
+    instance_of,
+    positive,
+    refusals_of,
+    require,
+)
 from jaxslam.laser.matching._matcher import Matcher
 from jaxslam.laser.matching._outcome import information_of
 from jaxslam.laser.matching._point_sets import Points, move_along_rays
@@ -114,22 +120,15 @@ class AlongNormals(MatchCovariance):
     sigma: ArrayLike
     """standard deviation of a range [m]"""
     _: dataclasses.KW_ONLY
-    span: int = static(default=SPAN)
+    span: int = static(default=SPAN, check=at_least(1))
     """see `IcpSettings.span`"""
-    gap: Number = GAP
+    gap: Number = field(default=GAP, check=positive)
     """see `IcpSettings.gap`"""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_count("AlongNormals: span", self.span)
-        check_positive("AlongNormals", gap=self.gap)
 
     def of_usable(self, matcher: Matcher, scans: MatchedScans) -> Float[Array, "3 3"]:
         reference, points, match, *_ = scans
-        if not isinstance(reference, Points):
-            raise ValueError(
-                f"AlongNormals: takes a reference of Points, got {type(reference).__name__}"
-            )
+        with refusals_of("AlongNormals"):
+            reference = require("reference", reference, instance_of(Points))
         lines = surface(reference, self.span, self.gap)
         j = jnp.maximum(match.pair, 0)  # any partner for points without: their weight is 0
         weight = jnp.where(lines.straight[j], match.weight, 0.0)

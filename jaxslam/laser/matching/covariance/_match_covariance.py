@@ -8,8 +8,9 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, PyTree
 
-from jaxslam.core._numbers import check_positive
+from jaxslam.core._record import check_field
 from jaxslam.core.protocols import Component
+from jaxslam.core.validation import positive
 from jaxslam.laser.matching._matcher import Match, Matcher, MatchStatus, Reference
 from jaxslam.laser.matching._point_sets import Points, move_along_rays, prior_terms
 from jaxslam.math import _linalg as linalg
@@ -38,7 +39,7 @@ class MatchCovariance(Component):
     def __post_init__(self) -> None:
         self._check(MatchCovariance, {"of_usable": "matcher, scans"})
         if hasattr(self, "sigma"):
-            check_positive(type(self).__name__, sigma=self.sigma)
+            check_field(self, "sigma", positive)
 
     def of_usable(self, matcher: Matcher, scans: MatchedScans) -> Float[Array, "3 3"]:
         """The covariance of a match that did not fail, and finite if it did. Of a pair: vmap it."""

@@ -12,8 +12,8 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from jaxslam.core._numbers import check_count, check_covariance, check_positive, held_array
-from jaxslam.core._record import record, set_field, static
+from jaxslam.core._record import field, record, static
+from jaxslam.core.validation import at_least, covariance, positive
 from jaxslam.laser.matching._matcher import Matcher
 from jaxslam.laser.matching._point_sets import Points, move_along_rays, prior_cost
 from jaxslam.laser.matching.covariance._implicit import Implicit
@@ -46,17 +46,12 @@ class Lattice(MatchCovariance):
     sigma: ArrayLike
     """standard deviation of a residual [m]"""
     _: dataclasses.KW_ONLY
-    window: Number = 0.3
+    window: Number = field(default=0.3, check=positive)
     """[m] standard deviation of x and y in a window, which acts as a further prior"""
-    turn_window: Number = 0.3
+    turn_window: Number = field(default=0.3, check=positive)
     """[rad] standard deviation of the heading in the window"""
-    steps: int = static(default=13)
+    steps: int = static(default=13, check=at_least(3))
     """poses along each axis"""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_positive("Lattice", window=self.window, turn_window=self.turn_window)
-        check_count("Lattice: steps", self.steps, 3)
 
     def of_usable(self, matcher: Matcher, scans: MatchedScans) -> Float[Array, "3 3"]:
         axis = np.linspace(-4.0, 4.0, self.steps)  # 4 σ of the peak: exp(-8) is left out
@@ -101,12 +96,8 @@ class Unscented(MatchCovariance):
 
     sigma: ArrayLike
     """standard deviation of a range [m]"""
-    start_cov: ArrayLike
+    start_cov: ArrayLike = field(check=covariance(3))
     """(3, 3) covariance of the start"""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _hold_start_cov(self)
 
     def of_usable(self, matcher: Matcher, scans: MatchedScans) -> Float[Array, "3 3"]:
         reference, points, match, start, _ = scans
@@ -132,15 +123,10 @@ class Sampling(MatchCovariance):
 
     sigma: ArrayLike
     """standard deviation of a range [m]"""
-    start_cov: ArrayLike
+    start_cov: ArrayLike = field(check=covariance(3))
     """(3, 3) covariance of the start"""
-    samples: int = static(default=30)
+    samples: int = static(default=30, check=at_least(1))
     """number of matches"""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _hold_start_cov(self)
-        check_count("Sampling: samples", self.samples)
 
     def of_usable(self, matcher: Matcher, scans: MatchedScans) -> Float[Array, "3 3"]:
         reference, points, match, start, key = scans
@@ -173,11 +159,6 @@ class Sampling(MatchCovariance):
         ends = jax.vmap(match_with_noise)(jax.random.split(key, self.samples))
         apart = _pose_differences(ends, match.pose)
         return apart.T @ apart / self.samples
-
-
-def _hold_start_cov(of: Unscented | Sampling) -> None:
-    check_covariance(type(of).__name__, of.start_cov, 3)
-    set_field(of, "start_cov", held_array(of.start_cov))
 
 
 def _pose_differences(poses: Float[Array, "S 3"], middle: Float[Array, "3"]) -> Float[Array, "S 3"]:
