@@ -14,16 +14,27 @@ from jaxslam.consistency._measures import Measure, register
 from jaxslam.consistency._measures.coverage import credibility
 from jaxslam.consistency._measures.measure import Nees, Runs, RunScores, RunStatistics
 from jaxslam.consistency._measures.nees import block_nees, pose_error
+from jaxslam.consistency._recording import (
+    ClockLag,
+    RecordedBlock,
+    RecordedErrors,
+    RecordingScores,
+    judge_recording,
+)
 from jaxslam.consistency._run_scores import Score, score
 from jaxslam.consistency._summary import Summary
 from jaxslam.consistency._verdict import Verdict, judge
 
 __all__ = [
     "Average",
+    "ClockLag",
     "LocalizationScores",
     "LocalizationSummary",
     "Measure",
     "Nees",
+    "RecordedBlock",
+    "RecordedErrors",
+    "RecordingScores",
     "RunScores",
     "RunStatistics",
     "Runs",
@@ -36,6 +47,7 @@ __all__ = [
     "credibility",
     "judge",
     "judge_localization",
+    "judge_recording",
     "pose_error",
     "posterior_bound",
     "register",
