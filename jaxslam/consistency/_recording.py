@@ -22,7 +22,7 @@ from jaxslam.core.logs._streams import geodesic_poses, known_poses
 from jaxslam.core.validation import InvalidField
 from jaxslam.math._definite import asymmetric, invertible
 from jaxslam.math.numpy_poses import compose, inverse, wrapped
-from jaxslam.math.stats import chi2_quantile, t_quantile
+from jaxslam.math.stats import chi2_quantile, normal_quantile, t_quantile
 
 COMPONENTS = ("along", "across", "heading")
 """The components of the error, in the axes of the estimate."""
@@ -183,8 +183,9 @@ def judge_recording(
     heading. An honest q has the mean d = 3, 2 or 1, and its ellipsoid of level p, {q <= χ²_d(p)},
     covers the truth with probability p.
 
-    **Intervals.** Write P = L Lᵀ, z = L⁻¹ e, so q = zᵀz, and C_k = (1/n) Σ z_t z_{t+k}ᵀ. For
-    Gaussian errors cov(q_t, q_{t+k}) = 2 |C_k|² (Frobenius; Isserlis 1918), so that
+    **Intervals.** With e and P in the axes of the world write P = L Lᵀ, z = L⁻¹ e, so q = zᵀz, and
+    C_k = (1/n) Σ z_t z_{t+k}ᵀ. For Gaussian errors cov(q_t, q_{t+k}) = 2 |C_k|² (Frobenius;
+    Isserlis 1918), so that
 
         var q̄ = (2/n) Σ_k |C_k|²,    ν = 2 q̄²/var q̄,    ν q̄/E q ~ χ²_ν approximately,
 
@@ -194,12 +195,14 @@ def judge_recording(
     that stays is one error, however often it is seen. The sum ends where |C_k|² first is no larger
     than independent errors have it, and is without what such noise adds (Bartlett 1946). Where the
     autocovariances of q itself, over the same lags, have a larger sum, they take the place of
-    2 |C_k|²: with heavy tails, or a correlation that changes along the way. Factors
-    of σ are √(mean z_i²), z_i = e_i/σ_i, with the roots of that interval. Coverage has the interval
-    of Jeffreys, with the number of independent indicators of q <= χ²_d(p) that follows from the
-    same correlation (Kibble 1941) in place of the number of poses; Korn & Graubard 1998 so treat
-    surveys. `python -m benchmarks --only recordings` measures
-    how often they hold.
+    2 |C_k|²: with heavy tails, or a correlation that changes along the way. Errors that are
+    correlated over K poses show ν in some n/2K stretches, so intervals take ν (z/t)², with the
+    quantiles of the normal and of Student's t with n/2K degrees of freedom (as Korn & Graubard
+    1998, "Confidence intervals for proportions with small expected number of positive counts",
+    Survey Methodology 24). Factors of σ are √(mean z_i²), z_i = e_i/σ_i, with the roots of that
+    interval. Coverage has the interval of Jeffreys, with the number of independent indicators of
+    q <= χ²_d(p) that follows from the same correlation (Kibble 1941) in place of the number of
+    poses. `python -m benchmarks --only recordings` measures how often they hold.
 
     **Lag.** The least-squares δ and b of e_t = δ ξ_t + b, with ξ the velocity of the truth in the
     axes of the estimate and b a constant offset, components weighted by their variance; the truth
@@ -212,9 +215,9 @@ def judge_recording(
     to them, as where a filter forgets it, or is contained in them, as in odometry, P does not say:
     honest is a mean NEES of d ∓ mean tr P⁻¹ J P₀ Jᵀ, with J P₀ Jᵀ the covariance of the first error
     carried to each pose. "best" carries the truth by the rigid motion a that minimizes Σ eᵀ P⁻¹ e,
-    which takes with it the error that all poses share: honest is d (1 - g), with g the share of
-    Σ eᵀ P⁻¹ e that it takes, estimated from the long-run covariance of the gradients. A constant
-    offset between the two frames cannot be seen then.
+    which takes with it the error that all poses share: honest is d (1 - 2g) to d, with g the
+    expected share of Σ eᵀ P⁻¹ e that it takes, from the long-run covariance of the gradients
+    Jᵀ P⁻¹ e. A constant offset between the two frames cannot be seen then.
 
     **Covariances** that are zero, not finite, not symmetric, singular, above 1e4 m² or rad², of
     -1 first, which in ROS is an unknown one, or constant from beginning to end, which no filter
@@ -291,8 +294,8 @@ def judge_recording(
         valid = judged["heading" if name == "heading" else "position"]
         if valid.sum() > 1:
             scaled = error[valid, k] / np.sqrt(claims.cov[valid, k, k])
-            square = _mean_square(scaled[:, None]).average
             low, high = aligned.honest(k, valid)
+            square = _mean_square(scaled[:, None], 1 - (low + high) / 2).average
             factors[name] = Average(
                 float(np.sqrt(square.value / ((low + high) / 2))),
                 float(np.sqrt(square.low / high)),
@@ -405,6 +408,8 @@ class _Claims(NamedTuple):
     """by block of `DOF`"""
     faults: dict[str, Bool[np.ndarray, "n"]]
     """poses by what is wrong with their covariance"""
+    turn: Float[np.ndarray, "n 3 3"]
+    """matrices that turn (x, y, θ) of the world into the axes of the estimate"""
 
     @classmethod
     def of(
@@ -415,25 +420,24 @@ class _Claims(NamedTuple):
     ) -> "_Claims":
         """The claims of covariances, None for none, in the axes of the frame."""
         count = len(pose)
+        turn = np.stack([_in_axes(pose, np.tile(axis, (count, 1))) for axis in np.eye(3)], axis=2)
         unit = np.tile(np.eye(3), (count, 1, 1))
         if cov is None:
-            return cls(unit, {name: np.zeros(count, bool) for name in DOF}, {})
+            return cls(unit, {name: np.zeros(count, bool) for name in DOF}, {}, turn)
         is_unknown = cov[:, 0, 0] == -1
-        by_part: dict[str, dict[str, Bool[np.ndarray, n]]] = {}
+        by_part: dict[str, dict[str, np.ndarray]] = {}
         valid = {}
         for name, axes in _AXES.items():
             block = cov[:, axes, axes]
             finite = np.isfinite(block).all(axis=(1, 2))
             safe = np.where(finite[:, None, None], block, 0.0)
             variance = np.diagonal(safe, axis1=1, axis2=2)
-            constant = count > 1 and bool((block == block[:1]).all())
             tests = {
                 "-1 first, unknown": is_unknown,
                 "not finite": ~finite,
                 "zero": (safe == 0).all(axis=(1, 2)),
                 f"above {LARGEST:g}": (variance > LARGEST).any(axis=1),
-                "constant from beginning to end": np.full(count, constant),
-                "not symmetric": asymmetric(safe, 1e-6),  # float32 in CSV files of nine digits
+                "not symmetric": asymmetric(safe, 1e-6),  # of float32
                 "singular, or not positive definite": ~invertible(safe),
             }
             faulty = np.zeros(count, bool)
@@ -441,7 +445,10 @@ class _Claims(NamedTuple):
             for reason, fails in tests.items():  # the first reason that holds
                 by_part[name][reason] = fails & ~faulty
                 faulty = faulty | fails
-            valid[name] = ~faulty
+            others = block[~faulty]
+            constant = ~faulty & (len(others) > 1 and bool((others == others[:1]).all()))
+            by_part[name]["constant from beginning to end"] = constant
+            valid[name] = ~faulty & ~constant
         valid["pose"] &= valid["position"] & valid["heading"]
         faults = {}
         for reason, position in by_part["position"].items():
@@ -456,7 +463,6 @@ class _Claims(NamedTuple):
         safe = np.where(usable[:, None, None], np.nan_to_num(cov), unit)
         safe = (safe + np.swapaxes(safe, 1, 2)) / 2
         if frame == "world":
-            turn = _axes_of(pose)
             safe = turn @ safe @ np.swapaxes(turn, 1, 2)
         # A block without the other: nothing of the other enters.
         safe[~valid["position"], :2] = safe[~valid["position"], :, :2] = 0.0
@@ -464,7 +470,7 @@ class _Claims(NamedTuple):
         for name in ("position", "heading"):
             for k in range(3)[_AXES[name]]:
                 safe[~valid[name], k, k] = 1.0
-        return cls(safe, valid, faults)
+        return cls(safe, valid, faults, turn)
 
     def weight(self, part: str | int, valid: Bool[np.ndarray, "n"]) -> Float[np.ndarray, "n 3 3"]:
         """M of eᵀ M e, the square of a block of the error, or of component k; 0 if not valid."""
@@ -472,11 +478,6 @@ class _Claims(NamedTuple):
         weight = np.zeros_like(self.cov)
         weight[:, axes, axes] = np.linalg.inv(self.cov[:, axes, axes])
         return np.where(valid[:, None, None], weight, 0.0)
-
-
-def _axes_of(pose: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 3"]:
-    """The matrices that turn (x, y, θ) of the world into the axes of poses."""
-    return np.stack([_in_axes(pose, np.tile(unit, (len(pose), 1))) for unit in np.eye(3)], axis=2)
 
 
 class _Alignment(NamedTuple):
@@ -503,7 +504,7 @@ class _Alignment(NamedTuple):
         is_known: Bool[np.ndarray, "n"],
     ) -> "_Alignment":
         """The truth carried as `align` says, by the poses at which it is known."""
-        turn = _axes_of(pose)
+        turn = claims.turn
         frame, centre, notes = np.zeros(3), np.zeros(3), ()
         start_cov, weight = np.zeros((3, 3)), np.zeros_like(turn)
         start = int(np.argmax(is_known))
@@ -512,7 +513,7 @@ class _Alignment(NamedTuple):
             notes = ("aligned at the first pose: its error is in all of the others",)
             if claims.valid["pose"][start]:
                 start_cov = turn[start].T @ claims.cov[start] @ turn[start]
-            elif claims.valid["pose"].any():
+            elif claims.valid["pose"].any() and not claims.faults["covariance zero"][start]:
                 notes += ("the first pose has no valid covariance: honest values leave it out",)
         elif align == "best":
             usable = is_known & claims.valid["pose"]
@@ -561,15 +562,20 @@ class _Alignment(NamedTuple):
         curvature, s = _normal_equations(self.lever, self.weight, self.error)
         block_curvature, u = _normal_equations(self.lever, weight, self.error)
         used = self.weight.any(axis=(1, 2))
-        error = np.where(used[:, None], self.error, 0.0)
+        error = np.einsum("nji,nj->ni", self.claims.turn, self.error)  # in the axes of the world
+        error = np.where(used[:, None], error, 0.0)
         size = np.sqrt((error**2).mean(axis=0))
         length = _correlation_length(error / np.where(size > 0, size, 1.0))
+        # What is left has no mean, which takes a share 2K/n of its long-run covariance.
+        remains = max(1 - (2 * length - 1) / used.sum(), 0.5)
         root = np.linalg.inv(curvature)
         shared = root @ _long_run(s, s, length) @ root
         removed = 2 * np.trace(_long_run(u, s, length) @ root) - np.trace(block_curvature @ shared)
+        removed /= remains
         left = float(np.einsum("ni,nij,nj->", self.error, weight, self.error))
         share = float(np.clip(removed / (left + removed), 0.0, 1.0)) if removed > 0 else 0.0
-        return dof * (1 - share), dof * (1 - share)
+        # What it takes is random, as it is of a few errors: from nothing to twice its expectation.
+        return dof * max(1 - 2 * share, 0.0), dof
 
 
 def _lever(
@@ -630,17 +636,21 @@ class _MeanSquare(NamedTuple):
     r: Float[np.ndarray, "K"]
     """correlation of q_t and q_{t+k}, of Gaussian errors, from k = 0 to where it ends"""
     excess: float
-    """variance of q̄ over that of Gaussian errors, at least 1"""
+    """variance of q̄ over that of Gaussian errors, and what its estimate adds to the interval"""
 
 
-def _mean_square(z: Float[np.ndarray, "n d"]) -> _MeanSquare:
-    """The mean square of errors z that are correlated; see `judge_recording`."""
+def _mean_square(z: Float[np.ndarray, "n d"], taken: float = 0.0) -> _MeanSquare:
+    """The mean square of errors z that are correlated; see `judge_recording`.
+
+    taken: share of zᵀz that an alignment has taken from all of them alike, if above 0.
+    """
     count, dof = z.shape
     q = (z**2).sum(axis=1)
     mean = float(q.mean())
     if not mean > 0:
         return _MeanSquare(Average(mean, 0.0, np.inf), 1.0, np.ones(1), 1.0)
-    products = _products(z, z) / count
+    before = mean / (1 - np.clip(taken, 0.0, 0.9))  # the alignment
+    products = _products(z, z) / count + (before - mean) / dof * np.eye(dof)
     square = np.trace(products, axis1=1, axis2=2) ** 2
     size = (products**2).sum(axis=(1, 2))
     # The expectation of |C_k|² of errors that are independent at lag k, and correlated at the lags
@@ -655,9 +665,13 @@ def _mean_square(z: Float[np.ndarray, "n d"]) -> _MeanSquare:
     gaussian = 2 * float(size[0] + 2 * size[1:].sum())
     centred = (q - mean)[:, None]
     excess = max(1.0, float(_long_run(centred, centred, length)[0, 0]) / count / gaussian)
-    nu = float(np.clip(2 * count * mean**2 / (excess * gaussian), 1.0, count * dof))
-    low, high = (nu * mean / chi2_quantile(p, nu) for p in ((1 + LEVEL) / 2, (1 - LEVEL) / 2))
-    return _MeanSquare(Average(mean, low, high), nu, size / size[0], excess)
+    nu = float(np.clip(2 * count * before**2 / (excess * gaussian), 1.0, count * dof))
+    # Of n/2K stretches; Student's t in place of the normal
+    half = t_quantile((1 + LEVEL) / 2, max(count / (2 * length), 1.0))
+    shrunk = (normal_quantile((1 + LEVEL) / 2) / half) ** 2
+    fewer = max(nu * shrunk, 1.0)
+    low, high = (fewer * mean / chi2_quantile(p, fewer) for p in ((1 + LEVEL) / 2, (1 - LEVEL) / 2))
+    return _MeanSquare(Average(mean, low, high), nu, size / size[0], excess / shrunk)
 
 
 def _share(inside: Bool[np.ndarray, "n"], level: float, dof: int, nees: _MeanSquare) -> Average:
@@ -700,8 +714,9 @@ def _error_of_sum(scores: Float[np.ndarray, "n 1"]) -> tuple[float, float]:
     total = float((scores**2).sum())
     if not total > 0:
         return 0.0, 1.0
-    long_run = max(float(_long_run(scores, scores, _correlation_length(scores))[0, 0]), total)
-    return float(np.sqrt(long_run)), max(len(scores) * total / long_run - 1, 1.0)
+    length = _correlation_length(scores)
+    long_run = max(float(_long_run(scores, scores, length)[0, 0]), total)
+    return float(np.sqrt(long_run)), max(len(scores) / (2 * length), 1.0)
 
 
 def _blocks(
@@ -713,10 +728,13 @@ def _blocks(
         if valid.sum() < 2:
             continue
         axes, dof = _AXES[name], DOF[name]
-        root = np.linalg.cholesky(aligned.claims.cov[valid][:, axes, axes])
-        z = np.linalg.solve(root, aligned.error[valid, axes, None])[..., 0]
-        nees = _mean_square(z)
+        # In the axes of the world, where an error that stays does not turn with the robot
+        turn = aligned.claims.turn[valid]
+        cov = np.swapaxes(turn, 1, 2) @ aligned.claims.cov[valid] @ turn
+        error = np.swapaxes(turn, 1, 2) @ aligned.error[valid, :, None]
+        z = np.linalg.solve(np.linalg.cholesky(cov[:, axes, axes]), error[:, axes])[..., 0]
         honest = aligned.honest(name, valid)
+        nees = _mean_square(z, 1 - sum(honest) / (2 * dof))
         square = (z**2).sum(axis=1)
         coverage, honest_coverage = {}, {}
         for level in LEVELS:

@@ -106,7 +106,7 @@ def test_the_number_of_independent_errors_is_that_of_monte_carlo(length):
 def test_intervals_hold_the_truth_of_correlated_errors():
     rng = np.random.default_rng(3)
     held = {"nees": [], "factor": [], "mean": [], "lag": [], "coverage": []}
-    for _ in range(150):
+    for _ in range(60):
         scores = judge_recording(*recorded(rng, 600, 10)[:2])
         held["nees"].append(scores.blocks["pose"].nees.low <= 3 <= scores.blocks["pose"].nees.high)
         held["factor"].append(scores.factors["across"].low <= 1 <= scores.factors["across"].high)
@@ -115,7 +115,7 @@ def test_intervals_hold_the_truth_of_correlated_errors():
         share = scores.blocks["pose"].coverage[0.9]
         held["coverage"].append(share.low <= 0.9 <= share.high)
     for name, within in held.items():
-        assert np.mean(within) >= 0.88, name  # 150 of 95 %: σ 1.8 %
+        assert np.mean(within) >= 0.85, name  # 60 of 95 %: σ 2.8 %
 
 
 def test_a_sigma_that_is_halved_is_too_small_by_two():
@@ -257,18 +257,18 @@ def test_the_best_alignment_is_undone_whatever_the_frame():
 def test_what_the_best_alignment_takes_is_in_the_honest_nees(length):
     rng = np.random.default_rng(12)
     nees, honest = ({"pose": [], "position": [], "heading": []} for _ in range(2))
-    for _ in range(100):
+    for _ in range(40):
         scores = judge_recording(*recorded(rng, 150, length)[:2], align="best")
         for name, block in scores.blocks.items():
             assert (
-                block.honest[0] == block.honest[1] <= {"pose": 3, "position": 2, "heading": 1}[name]
+                block.honest[0] <= block.honest[1] == {"pose": 3, "position": 2, "heading": 1}[name]
             )
             nees[name].append(block.nees.value)
-            honest[name].append(block.honest[0])
+            honest[name].append(np.mean(block.honest))
     for name, dof in (("pose", 3), ("position", 2), ("heading", 1)):
         taken_away = dof - np.mean(nees[name])
         accounted = dof - np.mean(honest[name])
-        error = np.std(nees[name]) / 10
+        error = np.std(nees[name]) / np.sqrt(40)
         assert abs(taken_away - accounted) < 3 * error + 0.3 * taken_away, name
     if not length:  # one of 150 independent errors
         np.testing.assert_allclose(np.mean(honest["pose"]), 3 * (1 - 1 / 150), atol=0.02)
@@ -278,7 +278,7 @@ def test_what_aligning_at_the_first_pose_does_is_in_the_honest_nees():
     """Independent errors add the first one to all others; of odometry they contain it."""
     rng = np.random.default_rng(13)
     forgotten, contained = [], []
-    for _ in range(200):
+    for _ in range(60):
         estimate, truth, _ = recorded(rng, 60)
         block = judge_recording(estimate, truth, align="first").blocks["pose"]
         forgotten.append((block.nees.value, *block.honest))

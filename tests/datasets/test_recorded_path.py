@@ -3,11 +3,14 @@
 import gzip
 
 import bags
+import jax
 import numpy as np
 import pytest
 from bags import SECOND, fixed, odometry, quaternion, stamped_pose, transform
 from cases import refused
 
+import jaxslam
+from jaxslam.consistency import judge_recording
 from jaxslam.core.types import Estimate
 from jaxslam.datasets import recorded_path
 from jaxslam.math import numpy_poses as poses
@@ -105,6 +108,31 @@ def test_two_frames_of_tf(tmp_path):
     np.testing.assert_allclose(
         recorded_path(f"{bag}:base_link:odom").pose, poses.inverse(PATH), atol=1e-12
     )
+
+
+def test_an_ekf_written_as_a_bag_has_the_scores_of_its_arrays(tmp_path):
+    world = jaxslam.scenarios.circle(steps=300)
+    filter = jaxslam.filters.Localization(world.motion, world.sensor, world.landmarks)
+    truth, log = jaxslam.simulate(world, jax.random.key(0))
+    run = jaxslam.run(filter, log, world.pose, world.pose_cov, jax.random.key(1)).estimate
+    pose, cov, path = (np.asarray(part, float) for part in (run.pose, run.pose_cov, truth.pose))
+    stamps = [START + k * SECOND for k in range(300)]
+    messages = [
+        stamped_pose(t, p, "/amcl_pose", c, kind="PoseWithCovarianceStamped")
+        for t, p, c in zip(stamps, pose, cov, strict=True)
+    ]
+    messages += [stamped_pose(t, p, "/mocap") for t, p in zip(stamps, path, strict=True)]
+    bag = bags.write(tmp_path, messages, "mcap")
+    estimate, reference = recorded_path(f"{bag}:/amcl_pose"), recorded_path(f"{bag}:/mocap")
+    read = judge_recording(
+        (estimate.time, estimate.pose, estimate.cov), (reference.time, reference.pose)
+    )
+    time = np.array(stamps) / SECOND
+    scores = judge_recording((time, pose, cov), (time, path))
+    assert read.verdict == scores.verdict
+    for name, block in scores.blocks.items():
+        np.testing.assert_allclose(read.blocks[name].nees, block.nees, rtol=1e-6)
+    assert scores.blocks["pose"].nees.low < 3 < scores.blocks["pose"].nees.high
 
 
 def written(folder, zipped=False):
