@@ -162,7 +162,7 @@ class RecordingScores:
             "  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]).rstrip()
             for row in rows
         ]
-        dropped = [f"{count:,} poses: {reason}" for reason, count in self.dropped.items()]
+        dropped = [f"{count:,} of the poses: {reason}" for reason, count in self.dropped.items()]
         doubts = [f"* {doubt}" for doubt in self.doubts]
         return "\n".join([*lines, *([""] * bool(dropped or doubts)), *dropped, *doubts])
 

@@ -300,10 +300,10 @@ def test_what_aligning_at_the_first_pose_does_is_in_the_honest_nees():
         ]
         contained.append((block.nees.value, *block.honest))
     nees, low, high = np.mean(forgotten, axis=0)
-    np.testing.assert_allclose(nees, high, rtol=0.1)
+    np.testing.assert_allclose(nees, high, rtol=0.25)
     assert low < 3 < high
     nees, low, high = np.mean(contained, axis=0)
-    np.testing.assert_allclose(nees, low, rtol=0.1)
+    np.testing.assert_allclose(nees, low, rtol=0.25)
 
 
 def test_the_table_and_the_record():

@@ -58,6 +58,7 @@ def recording_figure(scores: RecordingScores, *, title: str = "", width: float =
         top = _HEIGHT * max(sizes) or 1.0
         axes.set_ylim(-top, top)
         ordinate(axes, f"{name} [{'°' if name == 'heading' else 'm'}]", 0.16 * width + 0.3)
+    figure.align_ylabels(panels)
     panels[-1].set_xlim(0.0, max(float(np.nanmax(time)), 1e-9))
     panels[-1].set_xlabel("time [s]")
     handles = panels[0].get_legend_handles_labels()[0] or None
