@@ -505,7 +505,8 @@ class _Alignment(NamedTuple):
     ) -> "_Alignment":
         """The truth carried as `align` says, by the poses at which it is known."""
         turn = claims.turn
-        frame, centre, notes = np.zeros(3), np.zeros(3), ()
+        frame, centre = np.zeros(3), np.zeros(3)
+        notes: tuple[str, ...] = ()
         start_cov, weight = np.zeros((3, 3)), np.zeros_like(turn)
         start = int(np.argmax(is_known))
         if align == "first":
