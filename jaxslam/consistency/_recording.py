@@ -640,17 +640,17 @@ class _MeanSquare(NamedTuple):
     """variance of q̄ over that of Gaussian errors, and what its estimate adds to the interval"""
 
 
-def _mean_square(z: Float[np.ndarray, "n d"], taken: float = 0.0) -> _MeanSquare:
+def _mean_square(z: Float[np.ndarray, "n d"], absorbed: float = 0.0) -> _MeanSquare:
     """The mean square of errors z that are correlated; see `judge_recording`.
 
-    taken: share of zᵀz that an alignment has taken from all of them alike, if above 0.
+    absorbed: share of zᵀz that an alignment has taken from all of them alike, if above 0.
     """
     count, dof = z.shape
     q = (z**2).sum(axis=1)
     mean = float(q.mean())
     if not mean > 0:
         return _MeanSquare(Average(mean, 0.0, np.inf), 1.0, np.ones(1), 1.0)
-    before = mean / (1 - np.clip(taken, 0.0, 0.9))  # the alignment
+    before = mean / (1 - np.clip(absorbed, 0.0, 0.9))  # the alignment
     products = _products(z, z) / count + (before - mean) / dof * np.eye(dof)
     square = np.trace(products, axis1=1, axis2=2) ** 2
     size = (products**2).sum(axis=(1, 2))
