@@ -27,6 +27,7 @@ BENCHMARKS = {
     "gradient": "gradient",
     "film": "film",
     "verdict": "verdict",
+    "recordings": "recordings",
     "precision": "precision",
     "campaigns": "campaigns",
     "circle": "published:circle",

@@ -16,17 +16,28 @@ from jaxslam.consistency._measures.coverage import credibility
 from jaxslam.consistency._measures.measure import Nees, Runs, RunScores, RunStatistics
 from jaxslam.consistency._measures.nees import block_nees, pose_error
 from jaxslam.consistency._pairs import PairedDifference
+from jaxslam.consistency._recording import (
+    ClockLag,
+    RecordedBlock,
+    RecordedErrors,
+    RecordingScores,
+    judge_recording,
+)
 from jaxslam.consistency._run_scores import Score, score
 from jaxslam.consistency._summary import Summary
 from jaxslam.consistency._verdict import Verdict, judge
 
 __all__ = [
     "Average",
+    "ClockLag",
     "LocalizationScores",
     "LocalizationSummary",
     "Measure",
     "Nees",
     "PairedDifference",
+    "RecordedBlock",
+    "RecordedErrors",
+    "RecordingScores",
     "RunScores",
     "RunStatistics",
     "Runs",
@@ -40,6 +51,7 @@ __all__ = [
     "draws",
     "judge",
     "judge_localization",
+    "judge_recording",
     "pose_error",
     "posterior_bound",
     "register",

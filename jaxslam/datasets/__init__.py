@@ -22,6 +22,7 @@ from jaxslam.datasets._laser_logs.carmen_reader import StampedRelations, carmen,
 from jaxslam.datasets._laser_logs.laser_record import LaserLog
 from jaxslam.datasets._laser_logs.rosbag_reader import BagContents, rosbag, rosbag_contents
 from jaxslam.datasets._noise_fit import DatasetFit, fit
+from jaxslam.datasets._recorded_path import RecordedPath, recorded_path
 from jaxslam.datasets._ros_map import read_map, write_map
 from jaxslam.datasets._uncertain_constants import AddedCov, consider_constants
 
@@ -48,6 +49,7 @@ __all__ = [
     "LaserLog",
     "MapTest",
     "Parameter",
+    "RecordedPath",
     "RobotCalibration",
     "StampedRelations",
     "Topic",
@@ -61,6 +63,7 @@ __all__ = [
     "plaza",
     "read_graph",
     "read_map",
+    "recorded_path",
     "relation_file",
     "rosbag",
     "rosbag_contents",

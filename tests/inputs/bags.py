@@ -92,9 +92,17 @@ def quaternion(heading):
 
 
 def odometry(
-    stamp, pose, topic="/odom", *, recorded=None, base="base_link", turned=None, frame="odom"
+    stamp,
+    pose,
+    topic="/odom",
+    *,
+    recorded=None,
+    base="base_link",
+    turned=None,
+    frame="odom",
+    cov=None,
 ):
-    """An Odometry of (x, y, θ), or of another quaternion `turned`."""
+    """An Odometry of (x, y, θ), or of another quaternion `turned`; cov of (x, y, θ)."""
     x, y, heading = map(float, pose)
 
     def make(types):
@@ -105,11 +113,37 @@ def odometry(
         return types("nav_msgs/msg/Odometry")(
             header(types, stamp, frame),
             base,
-            types("geometry_msgs/msg/PoseWithCovariance")(place, np.zeros(36)),
+            types("geometry_msgs/msg/PoseWithCovariance")(place, in_space(cov)),
             types("geometry_msgs/msg/TwistWithCovariance")(still, np.zeros(36)),
         )
 
     return Message(topic, "nav_msgs/msg/Odometry", stamp if recorded is None else recorded, make)
+
+
+def in_space(cov):
+    """The 36 numbers of a covariance of (x, y, θ)."""
+    full = np.zeros((6, 6))
+    full[np.ix_((0, 1, 5), (0, 1, 5))] = 0 if cov is None else cov
+    return full.reshape(-1)
+
+
+def stamped_pose(stamp, pose, topic, cov=None, *, kind="PoseStamped", frame="map", turned=None):
+    """A PoseStamped, PoseWithCovarianceStamped or TransformStamped of (x, y, θ)."""
+    x, y, heading = map(float, pose)
+
+    def make(types):
+        turn = types("geometry_msgs/msg/Quaternion")(*map(float, turned or quaternion(heading)))
+        to = header(types, stamp, frame)
+        of = types(f"geometry_msgs/msg/{kind}")
+        if kind == "TransformStamped":
+            moved = types("geometry_msgs/msg/Vector3")(x, y, 0.0)
+            return of(to, "base_link", types("geometry_msgs/msg/Transform")(moved, turn))
+        place = types("geometry_msgs/msg/Pose")(types("geometry_msgs/msg/Point")(x, y, 0.0), turn)
+        if kind == "PoseStamped":
+            return of(to, place)
+        return of(to, types("geometry_msgs/msg/PoseWithCovariance")(place, in_space(cov)))
+
+    return Message(topic, f"geometry_msgs/msg/{kind}", stamp, make)
 
 
 def transform(stamp, parent, child, moved, turned, topic="/tf"):

@@ -12,10 +12,14 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from jaxslam.math._odometry_jumps import lost_lines, odometry_jumps
-from jaxslam.math.numpy_poses import between
+from jaxslam.math.numpy_poses import between, compose, part
 
 Rule = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 """(times (K,), odometry (K, V), rows (T,)) -> control (T, U) that leads to each row"""
+
+
+Interpolation = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+"""(times (K,), poses (K, 3), rows (T,)) -> pose at each row (T, 3)"""
 
 
 class Rows(NamedTuple):
@@ -139,6 +143,18 @@ def interpolate_poses(
     return np.column_stack([x, y, np.arctan2(np.sin(heading), np.cos(heading))])
 
 
+def geodesic_poses(
+    clock: Float[np.ndarray, "K"], pose: Float[np.ndarray, "K 3"], rows: Float[np.ndarray, "T"]
+) -> Float[np.ndarray, "T 3"]:
+    """Poses at some times, at constant velocity on SE(2) between those given; before the first and
+    after the last these themselves. Headings in (-π, π]."""
+    lower = np.clip(np.searchsorted(clock, rows, side="right") - 1, 0, max(len(clock) - 2, 0))
+    upper = np.minimum(lower + 1, len(clock) - 1)
+    interval = clock[upper] - clock[lower]
+    share = np.clip((rows - clock[lower]) / np.where(interval > 0, interval, 1.0), 0.0, 1.0)
+    return compose(pose[lower], part(between(pose[lower], pose[upper]), share))
+
+
 GAP_FACTOR = 10
 """A longer interval between lines, in multiples of their median, is a gap."""
 
@@ -171,8 +187,9 @@ def known_poses(
     pose: Float[np.ndarray, "K 3"],
     rows: Float[np.ndarray, "T"],
     longest: float | None = None,
+    interpolate: Interpolation = interpolate_poses,
 ) -> tuple[Float[np.ndarray, "T 3"], Bool[np.ndarray, "T"]]:
-    """Poses at some times as `interpolate_poses`, and in which rows they are known; else NaN.
+    """Poses at some times as `interpolate` has them, and in which rows they are known; else NaN.
 
     A pose is unknown before the first line, after the last, in a gap (`is_gap`), over a jump that
     is no motion, and next to a line that is not finite or was written while the robot was lost.
@@ -185,7 +202,7 @@ def known_poses(
     joined = ~is_gap(clock, longest) & ~jump[1:] & finite[:-1] & finite[1:]
     unusable = clock[~finite]
     is_known = between_lines(clock, rows, joined) & ~np.isin(rows, unusable)
-    path = interpolate_poses(clock[finite], pose[finite], rows)
+    path = interpolate(clock[finite], pose[finite], rows)
     return np.where(is_known[:, None], path, np.nan), is_known
 
 

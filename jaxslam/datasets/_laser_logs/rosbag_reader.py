@@ -4,7 +4,7 @@ from bisect import bisect_right
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -124,7 +124,7 @@ def rosbag(
         laser = _chosen(bag, "scan", (LASER_SCAN, MULTI_ECHO), scan)
         if laser is None:
             raise bag.error(
-                f"expected a topic of {LASER_SCAN} with messages, got {_listed(bag.topics)}"
+                f"expected a topic of {LASER_SCAN} with messages, got {listed_topics(bag.topics)}"
             )
         wheels = None
         if odometry is None or ":" not in odometry:  # not two frames, as `odom:base_link`
@@ -136,14 +136,14 @@ def rosbag(
             frames = ", ".join([frame, *others])
             raise bag.error(f"{laser}: expected scans of one frame, got {frames}")
         if wheels is None or not Frames(transforms).connects(messages.base, frame):
-            transforms = transforms + _transforms(bag, static=False)
+            transforms = transforms + read_transforms(bag, static=False)
         if wheels is None:
             messages = _odometry_of_transforms(bag, messages, transforms, frame, odometry, source)
         placed, upside_down = _mount(bag, transforms, frame, messages, given_mount, corrections)
         for topic in bag.topics:
             if topic.name not in (laser, wheels) and topic.type not in TRANSFORMS and topic.count:
                 dropped[f"messages {topic.name}"] = topic.count
-        stamp, kept = _in_order(bag, laser, "scans", messages.scans, dropped, corrections)
+        stamp, kept = in_order(bag, laser, "scans", messages.scans, dropped, corrections)
         scans = [_ascending(messages.scans[k], upside_down) for k in kept]
         corrections += source
         joined = _odometry_at(bag, stamp, messages, wheels, dropped, corrections)
@@ -153,14 +153,14 @@ def rosbag(
         source=str(path),
         laser=laser,
         placed=False,
-        time=_seconds(stamp),
+        time=seconds(stamp),
         beams=beams,
         corrected=np.zeros((len(scans), 3)),
         raw=wrapped_path(joined.raw),
         odometry_known=joined.step_known,
         row=joined.row,
         odometry=wrapped_path(joined.poses),
-        odometry_time=_seconds(joined.stamp),
+        odometry_time=seconds(joined.stamp),
         max_range=limit,
         mount=placed,
         dropped=dict(dropped),
@@ -192,7 +192,7 @@ def rosbag_contents(path: str | Path) -> BagContents:
     Raises ValueError, with the file, if the bag cannot be read.
     """
     with open_bag(path) as bag:
-        transforms = _transforms(bag, static=True) + _transforms(bag, static=False)
+        transforms = read_transforms(bag, static=True) + read_transforms(bag, static=False)
         frames, pairs = Frames(transforms), frame_pairs(transforms)
         wheels = [topic for topic in bag.topics if topic.type == ODOMETRY and topic.count]
         base = ""
@@ -226,6 +226,16 @@ def rosbag_contents(path: str | Path) -> BagContents:
 def _only_child(pairs: Sequence[FramePair]) -> str:
     """The frame that moves, if there is one pair."""
     return pairs[0].child if len(pairs) == 1 else ""
+
+
+class Stamped(Protocol):
+    """A message with two times [ns]: the stamp of its header, and that of the recording."""
+
+    @property
+    def stamp(self) -> int: ...
+
+    @property
+    def recorded(self) -> int: ...
 
 
 class _ScanMessage(NamedTuple):
@@ -275,7 +285,7 @@ class _Odometry(NamedTuple):
     step_known: Bool[np.ndarray, "K"]
 
 
-def _listed(topics: Sequence[Topic]) -> str:
+def listed_topics(topics: Sequence[Topic]) -> str:
     """The text of topics with their types and counts."""
     listed = (f"{topic.name} ({topic.type}, {topic.count:,})" for topic in topics)
     return ", ".join(listed) or "no topics"
@@ -291,7 +301,7 @@ def _chosen(bag: Bag, argument: str, kinds: tuple[str, ...], name: str | None) -
             if len(candidates) > 1:
                 first = candidates[0].name
                 raise bag.error(
-                    f"expected one topic of {kind}, got {_listed(candidates)}; choose by "
+                    f"expected one topic of {kind}, got {listed_topics(candidates)}; choose by "
                     f"{argument}={first!r} ({option} {first})"
                 )
             if candidates:
@@ -299,7 +309,7 @@ def _chosen(bag: Bag, argument: str, kinds: tuple[str, ...], name: str | None) -
         return None
     topic = next((topic for topic in bag.topics if topic.name in (name, f"/{name}")), None)
     if topic is None:
-        listed = _listed([topic for topic in bag.topics if topic.type in kinds] or bag.topics)
+        listed = listed_topics([topic for topic in bag.topics if topic.type in kinds] or bag.topics)
         raise bag.error(f"{argument} ({option}): expected a topic of {listed}; got {name!r}")
     if topic.type not in kinds:
         raise bag.error(
@@ -333,7 +343,7 @@ def _read(bag: Bag, laser: str, wheels: str | None, corrections: list[str]) -> _
             )
     if not any(len(scan.ranges) for scan in scans):
         raise bag.error(f"{laser}: expected scans with beams, got {len(scans)} of 0 beams")
-    return _Messages(scans, odometry, base, _transforms(bag, static=True))
+    return _Messages(scans, odometry, base, read_transforms(bag, static=True))
 
 
 def _scan_of(
@@ -374,7 +384,7 @@ def _ascending(scan: _ScanMessage, upside_down: bool) -> _ScanMessage:
     return scan._replace(angles=angles)
 
 
-def _transforms(bag: Bag, static: bool) -> list[Transform]:
+def read_transforms(bag: Bag, static: bool) -> list[Transform]:
     """The transforms of `/tf_static`, or of `/tf`."""
     names = [
         topic.name
@@ -467,11 +477,11 @@ def _mount(
     return given_mount, bool(placed and placed.upside_down)
 
 
-def _in_order(
+def in_order(
     bag: Bag,
     topic: str,
     kind: str,
-    messages: Sequence[_ScanMessage] | Sequence[_PoseMessage],
+    messages: Sequence[Stamped],
     dropped: Counter[str],
     corrections: list[str],
 ) -> tuple[Int[np.ndarray, "K"], Int[np.ndarray, "K"]]:
@@ -552,12 +562,12 @@ def _odometry_at(
     if lost := int((~good).sum()):
         dropped["odometry without a pose"] = lost
     usable = [message for message, fine in zip(messages.odometry, good, strict=True) if fine]
-    stamp, kept = _in_order(bag, topic, "odometry", usable, dropped, corrections)
+    stamp, kept = in_order(bag, topic, "odometry", usable, dropped, corrections)
     path = path[good][kept]
     row = np.searchsorted(stamp, time, side="right") - 1
     within = (row >= 0) & (time <= stamp[-1])
     if not within.any():
-        (a, b), (c, d) = _seconds(time[[0, -1]]), _seconds(stamp[[0, -1]])
+        (a, b), (c, d) = seconds(time[[0, -1]]), seconds(stamp[[0, -1]])
         raise bag.error(
             f"expected scans within the time of {topic}, from {c:.3f} s to {d:.3f} s, got scans "
             f"from {a:.3f} s to {b:.3f} s"
@@ -585,14 +595,14 @@ def _odometry_at(
             f"scans between two messages of {topic} that are more than {GAP * 1e-9:g} s apart, "
             f"with a constant velocity in between: {slow:,}"
         )
-    jump = odometry_jumps(path, _seconds(stamp - stamp[0]))
+    jump = odometry_jumps(path, seconds(stamp - stamp[0]))
     if jump.any():
         at = int(np.argmax(jump))
         far, turn = step_sizes(path)[at]
         corrections.append(
             f"jumps of {topic}, which are no motion, so that the steps over them are unknown: "
             f"{int(jump.sum()):,}, first by {far:.3g} m and {np.rad2deg(turn):.3g}° in "
-            f"{interval[at] * 1e-9:.3g} s at {_seconds(stamp[at : at + 1])[0]:.3f} s"
+            f"{interval[at] * 1e-9:.3g} s at {seconds(stamp[at : at + 1])[0]:.3f} s"
         )
     # Not over gaps and jumps: there a scan has the pose of the message before it.
     share[gap | (jump[upper] & inside)] = 0.0
@@ -605,6 +615,6 @@ def _odometry_at(
     return _Odometry(path, stamp, row, raw, first | step_known)
 
 
-def _seconds(stamp: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+def seconds(stamp: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
     """Nanoseconds as seconds, rounded once."""
     return np.asarray(stamp // 10**9 + (stamp % 10**9) * 1e-9)

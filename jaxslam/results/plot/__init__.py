@@ -38,6 +38,7 @@ from jaxslam.results.plot._measure_figures import (
     whiteness_figure,
 )
 from jaxslam.results.plot._pose_errors import errors_figure
+from jaxslam.results.plot._recording_figure import recording_figure
 from jaxslam.results.plot._run_film import animate, animate_world, probe
 from jaxslam.results.plot._style import (
     COLORS,
@@ -90,6 +91,7 @@ __all__ = [
     "nees_figure",
     "panels_of",
     "probe",
+    "recording_figure",
     "rmse_figure",
     "titled",
     "topology_figure",
