@@ -135,7 +135,9 @@ def _judge_estimates(options: argparse.Namespace, command: str) -> int:
         campaign = judge_sources(
             world,
             {
-                name: folder_source(folder, draws, options.every, failures)
+                name: folder_source(
+                    folder, draws, world.sensor.measurements, options.every, failures
+                )
                 for name, folder in folders.items()
             },
             runs,

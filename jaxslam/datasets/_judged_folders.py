@@ -29,8 +29,8 @@ from jaxslam.consistency.campaign._run_estimates import (
 from jaxslam.core.logs._tables import POSE, TAG, TIME, split_unit
 from jaxslam.core.types import Log, Truth
 from jaxslam.core.validation import InvalidFile
+from jaxslam.datasets._landmark_logs.table_reader import MEASUREMENTS, ODOMETRY, CsvTable
 from jaxslam.datasets._landmark_logs.table_reader import MISSING as NO_NUMBER
-from jaxslam.datasets._landmark_logs.table_reader import ODOMETRY, CsvTable
 from jaxslam.datasets._lines import read_bytes, stored_file
 
 DRAWS, RUNS, TRUTH = "draws.json", "runs", "truth"
@@ -45,9 +45,9 @@ PROGRAM = "judge.json"
 _SAME_TIME = 0.5e-6
 """Largest difference of two times that are one [s]: half of the last digit of stamps in µs."""
 
-_SAME_TRUTH = 1e-6
-"""Largest difference [m, rad] of a truth in a file from the one drawn again here: beyond what
-another processor rounds differently."""
+_SAME = 1e-6
+"""Largest difference [m, rad] of a truth or a measurement in a file from the one drawn again here:
+beyond what another processor rounds differently."""
 
 _TIMES = ("t", "time")
 _POSE = ("x", "y", "theta")
@@ -130,26 +130,29 @@ def read_truth(draws: Path, name: str, steps: int) -> TruthOfRun:
 
 
 def folder_source(
-    estimates: Path, draws: DrawsFolder, every: int, failures: Mapping[int, RunFault]
+    estimates: Path,
+    draws: DrawsFolder,
+    measurements: Sequence[str],
+    every: int,
+    failures: Mapping[int, RunFault],
 ) -> Source:
     """The estimates in a folder, read run by run, as `judge_sources` takes them.
 
-    failures: of runs without an estimate, why there is none.
+    Args:
+        measurements: names of the numbers of a measurement, which are columns of a log.
+        failures: of runs without an estimate, why there is none.
     """
 
     def outcome_of(number: int, truth: Truth, log: Log) -> Outcome:
         name = run_name(number)
         in_file = read_truth(draws.path, name, len(truth.pose))
-        turn = 2 * math.pi
         gap = np.abs(in_file.pose - np.asarray(truth.pose, np.float64))
-        gap[:, 2] = np.minimum(gap[:, 2], np.abs(turn - gap[:, 2]))
-        if not (largest := float(gap.max())) <= _SAME_TRUTH:
-            raise InvalidFile(
-                draws.path / TRUTH / name / "truth.csv",
-                f"expected the truth that scenario {draws.scenario} draws here, got one that "
-                f"differs by {largest:.3g}: the scenario, or the version, is another; write the "
-                "draws again",
-            )
+        gap[:, 2] = np.minimum(gap[:, 2], np.abs(2 * math.pi - gap[:, 2]))
+        if not (largest := float(gap.max())) <= _SAME:
+            path = draws.path / TRUTH / name / "truth.csv"
+            raise _other_draws(path, draws, f"poses that differ by {largest:.3g}")
+        if number == 0:  # the other runs have the same key
+            _check_log(draws, name, measurements, log)
         truth = truth._replace(pose=in_file.pose)
         if number in failures:
             return Outcome(truth, None, failures[number])
@@ -161,6 +164,31 @@ def folder_source(
         return Outcome(truth, result, None, _seconds(folder / PROGRAM))
 
     return outcome_of
+
+
+def _check_log(draws: DrawsFolder, name: str, measurements: Sequence[str], log: Log) -> None:
+    """Raise ValueError unless the measurements of a run are those that are drawn here."""
+    path = draws.path / RUNS / name / MEASUREMENTS
+    valid = np.asarray(log.scan.valid)
+    if stored_file(path) is None or not valid.any():
+        return
+    in_file = CsvTable(path).table(measurements, "of measurements").values(measurements)
+    drawn = np.asarray(log.scan.z, np.float64)[valid]
+    if in_file.shape != drawn.shape:
+        raise _other_draws(path, draws, f"{len(in_file)} lines, where {len(drawn)} are drawn")
+    # Lines of one time are in any order.
+    largest = float(np.abs(np.sort(in_file, axis=0) - np.sort(drawn, axis=0)).max())
+    if not largest <= _SAME:
+        raise _other_draws(path, draws, f"numbers that differ by {largest:.3g}")
+
+
+def _other_draws(path: Path, draws: DrawsFolder, got: str) -> InvalidFile:
+    """The error about a file that is not what the scenario draws."""
+    return InvalidFile(
+        path,
+        f"expected what scenario {draws.scenario} draws here with the key of {DRAWS}, got {got}: "
+        "the scenario, or the version, is another; write the draws again",
+    )
 
 
 def _seconds(path: Path) -> float | None:
@@ -223,12 +251,6 @@ def _read_map(path: "_Table", truth: TruthOfRun) -> tuple[np.ndarray, ...]:
 
 def _read_innovations(path: "_Table", truth: TruthOfRun, size: int) -> Innovations | RunFault:
     """The innovations; columns that have no name of their own are ν, and S row by row."""
-    at = path.steps(truth)
-    if isinstance(at, RunFault):
-        return at
-    if (at < 0).any():
-        reason = "expected the time of a measurement, got one of odometry alone"
-        raise path.error(int(np.argmax(at < 0)), reason)
     used = {path.place(*_TIMES), path.place(TAG)}
     optional = {name: path.values((name,))[:, 0] for name in _OF_INNOVATIONS if name in path.names}
     used |= {path.place(name) for name in optional}
@@ -241,6 +263,12 @@ def _read_innovations(path: "_Table", truth: TruthOfRun, size: int) -> Innovatio
             f"S, got {', '.join(path.header)}",
             1,
         )
+    at = path.steps(truth)
+    if isinstance(at, RunFault):
+        return at
+    if (at < 0).any():
+        reason = "expected the time of a measurement, got one of odometry alone"
+        raise path.error(int(np.argmax(at < 0)), reason)
     numbers = path.numbers(places)
     tags = path.tags(path.place(TAG), truth.tags)
     S = _symmetric(numbers[:, size:], size)

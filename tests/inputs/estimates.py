@@ -57,12 +57,18 @@ def write_draws(folder, world, scenario, runs, key, steps):
     folder.mkdir()
     (folder / "draws.json").write_text(json.dumps(record))
     for number in range(runs):
-        truth, _ = jax.device_get(world_of_run(world, key, number))
+        truth, log = jax.device_get(world_of_run(world, key, number))
         run_folder, true_folder = (folder / kind / f"{number:04d}" for kind in ("runs", "truth"))
         run_folder.mkdir(parents=True)
         true_folder.mkdir(parents=True)
         time = range(world.steps + 1)
         (run_folder / "odometry.csv").write_text("t [s]\n" + "".join(f"{t}\n" for t in time))
+        scan, names = log.scan, ",".join(world.sensor.measurements)
+        rows = [
+            f"{t + 1},{scan.tag[t, m]},{','.join(map('{:.17g}'.format, scan.z[t, m]))}\n"
+            for t, m in np.argwhere(scan.valid)
+        ]
+        (run_folder / "measurements.csv").write_text(f"t [s],tag,{names}\n" + "".join(rows))
         rows = [
             f"{t + 1},{','.join(map('{:.17g}'.format, pose))}\n"
             for t, pose in enumerate(truth.pose)
