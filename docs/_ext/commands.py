@@ -43,6 +43,7 @@ LIMIT = 900
 BEGINS = {
     "consistency": "jaxslam._cli.campaigns.consistency:",
     "fit": "jaxslam._cli.recorded.fit:",
+    "judge": "jaxslam._cli.judge:",
     "localize": "jaxslam._cli.recorded.localize:",
     "map": "jaxslam._cli.recorded.make_map:",
     "optimize": "jaxslam._cli.optimize:",
