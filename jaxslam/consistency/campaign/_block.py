@@ -212,7 +212,7 @@ class BlockRunner:
             chart_error = np.swapaxes(jax.device_get(results.chart_error), 0, 1)
             by_run: PyTree = _on_host(results), truth, statistics, chart_error, measured
             by_run = jax.tree.map(lambda leaf: leaf[wanted], by_run)
-            score_of_runs = score(*thinned(*by_run, stride=plan.stride))
+            score_of_runs = score(*thinned(plan.stride, *by_run))
             scores[name] = condense(score_of_runs, first, float(self._limit))
         scores[BOUND] = {"limit": self._limit}
         if plan.bound:
@@ -224,12 +224,12 @@ class BlockRunner:
 
 
 def thinned(
+    stride: int,
     trace: Trace,
     truth: Truth,
     statistics: RunStatistics,
     chart_error: np.ndarray | None,
     measured: np.ndarray,
-    stride: int,
 ) -> tuple[Trace, Truth, RunStatistics, np.ndarray | None, np.ndarray]:
     """The arguments of `score` at steps k, 2k, …, T of R runs; k is `stride`.
 

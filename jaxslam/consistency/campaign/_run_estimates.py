@@ -365,7 +365,7 @@ def score_estimates(
     )
     measured = (info.status != Status.EMPTY).sum(axis=(1, 2))
     truth = truth._replace(missed=np.zeros((runs, shape.steps), int))
-    scores = score(*thinned(trace, truth, statistics, None, measured, stride))
+    scores = score(*thinned(stride, trace, truth, statistics, None, measured))
     # The coordinates of its error are not known; without innovations, nor is what it measured.
     measures = {name: value for name, value in scores.measures.items() if name != "nees_own"}
     sums = dict(scores.sums)
