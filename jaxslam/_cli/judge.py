@@ -20,6 +20,9 @@ from jaxslam.datasets._judged_folders import DrawsFolder, folder_source, read_dr
 from jaxslam.results import _campaign_files as campaign_files
 from jaxslam.results._campaign_files import FORMATS
 
+FOLDER = "estimates"
+"""Default folder of the estimates that the command computes."""
+
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `jaxslam judge`."""
@@ -29,7 +32,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         nargs="*",
         metavar="ESTIMATES",
         help="folders of estimates, one for each estimator: ESTIMATES/0000/trajectory.csv is of "
-        "run 0000, and so on, as `jaxslam run` writes it; map.csv and innovations.csv are optional",
+        "run 0000, and so on, as `jaxslam run` writes it; map.csv and innovations.csv are optional "
+        f"(default with --estimator: {FOLDER})",
     )
     parser.add_argument(
         "--draws", metavar="DIR", help="the folder of `jaxslam draws` that was estimated"
@@ -95,6 +99,8 @@ def _judge_estimates(options: argparse.Namespace, command: str) -> int:
     """Judge folders of estimates of a folder of draws."""
     jax.config.update("jax_enable_x64", True)
     formats = campaign_files.check_figure_formats("--figures", options.figures.split(","))
+    if not options.estimates and options.estimator is not None:
+        options.estimates = [FOLDER]
     if not options.estimates:
         raise ValueError("ESTIMATES: expected a folder of estimates, got none")
     if options.draws is None:

@@ -6,13 +6,16 @@ import sys
 import jax
 import numpy as np
 import pytest
+from cases import swept
 from command import run_command
-from estimates import write_draws, write_estimates
+from estimates import write_estimates
 
 from jaxslam import catalog, scenarios
+from jaxslam.consistency import write_draws
 from jaxslam.consistency.campaign import monte_carlo
 
 STEPS, RUNS, KEY = 20, 3, jax.random.key(4)
+OPTIONS = {"scenario": "circle", "steps": STEPS}
 ONE = ["--devices", "1", "--figures", "png"]
 
 
@@ -28,9 +31,9 @@ def ekf(world):
 
 @pytest.fixture(scope="module")
 def draws(world, tmp_path_factory):
-    return write_draws(
-        tmp_path_factory.mktemp("draws") / "draws", world, "circle", RUNS, KEY, STEPS
-    )
+    folder = tmp_path_factory.mktemp("draws") / "draws"
+    write_draws(world, RUNS, KEY, folder, options=OPTIONS)
+    return folder
 
 
 @pytest.fixture
@@ -91,6 +94,52 @@ def test_our_ekf_by_files_has_the_numbers_of_the_campaign(
     assert mine["verdict"] == ours["verdict"] == campaign.filters["ekf"].verdict
     assert "mine: the landmark NEES is of its final maps" in printed
     assert {"report.html", "nees.png", "map.png"} <= {path.name for path in out.iterdir()}
+
+
+WORLDS = """
+import dataclasses
+import numpy as np
+from jaxslam import scenarios, sensors
+
+circle = scenarios.circle(20)
+whole = scenarios.cloister(20)
+cloister = dataclasses.replace(whole, landmarks=np.asarray(whole.landmarks)[::4])
+bearings = dataclasses.replace(
+    cloister, filter_options={}, sensor=sensors.BearingOnly([[0.02**2]], free=([4.0], [[1.5**2]]))
+)
+ranges = dataclasses.replace(
+    cloister, filter_options={}, sensor=sensors.RangeOnly([[0.1**2]], free=([0.0], [[0.5**2]]))
+)
+"""
+
+
+@pytest.mark.parametrize("name", swept(["circle", "cloister", "bearings", "ranges"], "ranges"))
+def test_draws_that_our_command_runs_have_the_numbers_of_the_campaign(name, tmp_path, undrawn):
+    (tmp_path / "worlds.py").write_text(WORLDS)
+    scenario, folder = f"{tmp_path / 'worlds.py'}:{name}", tmp_path / "draws"
+    of_world = ["--scenario", scenario, "--runs", RUNS, "--seed", "3"]
+    assert run_command(["draws", *of_world, "--out", folder]) == 0
+    for number in range(RUNS):
+        run = folder / "runs" / f"{number:04d}"
+        out = tmp_path / "mine" / run.name
+        words = ["run", "--dataset", "table", run, "--innovations", "--out", out]
+        assert run_command(words) == 0
+    assert judge(tmp_path / "mine", "--draws", folder, "--out", tmp_path / "judged") == 0
+    campaign = ["consistency", *of_world, "--filters", "ekf", *ONE, "--out", tmp_path / "campaign"]
+    assert run_command(campaign) == 0
+    mine, ours = result(tmp_path / "judged"), result(tmp_path / "campaign")
+    assert mine["divergence_limit_m"] == pytest.approx(ours["divergence_limit_m"], rel=1e-9)
+    (mine,), (ours,) = (stored["filters"].values() for stored in (mine, ours))
+    assert (mine["verdict"], mine["rejected_by"]) == (ours["verdict"], ours["rejected_by"])
+    absent = {"nees_own", "nees_landmarks", "unobservable", "rotation_information"}
+    names = ours["measures"].keys() - absent
+    assert names == mine["measures"].keys() - absent and {"nis_per_dof", "nees_pose"} <= names
+    for measure in names:
+        numbers, exact = (
+            [np.nan if x is None else x for x in stored["measures"][measure].values()]
+            for stored in (mine, ours)
+        )
+        np.testing.assert_allclose(numbers, exact, rtol=1e-9, atol=1e-12, err_msg=measure)
 
 
 def test_times_are_matched_and_faults_are_named(draws, estimates, tmp_path, undrawn, capsys):
@@ -254,9 +303,8 @@ def test_folders_and_draws_are_asked_for(draws, estimates, tmp_path, refused):
 
 
 def test_draws_of_another_scenario_are_noticed(draws, estimates, tmp_path, refused, world):
-    other = write_draws(
-        tmp_path / "other", world, "circle", 1, jax.random.key(9), STEPS
-    )  # one path
+    other = tmp_path / "other"
+    write_draws(world, 1, jax.random.key(9), other, options=OPTIONS)  # the path is the same
     (other / "draws.json").write_text((draws / "draws.json").read_text())
     refused(
         ["judge", estimates, "--draws", other, "--out", tmp_path / "out", *ONE],

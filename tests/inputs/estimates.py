@@ -1,6 +1,4 @@
-"""Estimates of our own EKF as those of a stranger, and folders of draws and estimates."""
-
-import json
+"""Estimates of our own EKF as those of a stranger, in Python and in folders."""
 
 import jax
 import numpy as np
@@ -43,40 +41,6 @@ def as_a_stranger(world, ekf, traces=None):
         )
 
     return estimate
-
-
-def write_draws(folder, world, scenario, runs, key, steps):
-    """A folder of draws without logs: what `jaxslam judge` reads of it."""
-    numbers = np.asarray(jax.random.key_data(key)).tolist()
-    record = {
-        "scenario": world.name,
-        "runs": runs,
-        "key": {"kind": str(jax.random.key_impl(key)), "numbers": numbers},
-        "options": {"scenario": scenario, "steps": steps},
-    }
-    folder.mkdir()
-    (folder / "draws.json").write_text(json.dumps(record))
-    for number in range(runs):
-        truth, log = jax.device_get(world_of_run(world, key, number))
-        run_folder, true_folder = (folder / kind / f"{number:04d}" for kind in ("runs", "truth"))
-        run_folder.mkdir(parents=True)
-        true_folder.mkdir(parents=True)
-        time = range(world.steps + 1)
-        (run_folder / "odometry.csv").write_text("t [s]\n" + "".join(f"{t}\n" for t in time))
-        scan, names = log.scan, ",".join(world.sensor.measurements)
-        rows = [
-            f"{t + 1},{scan.tag[t, m]},{','.join(map('{:.17g}'.format, scan.z[t, m]))}\n"
-            for t, m in np.argwhere(scan.valid)
-        ]
-        (run_folder / "measurements.csv").write_text(f"t [s],tag,{names}\n" + "".join(rows))
-        rows = [
-            f"{t + 1},{','.join(map('{:.17g}'.format, pose))}\n"
-            for t, pose in enumerate(truth.pose)
-        ]
-        (true_folder / "truth.csv").write_text("t [s],x [m],y [m],theta [rad]\n" + "".join(rows))
-        rows = [f"{i},{x:.17g},{y:.17g}\n" for i, (x, y) in enumerate(truth.landmarks)]
-        (true_folder / "landmarks.csv").write_text("tag,x [m],y [m]\n" + "".join(rows))
-    return folder
 
 
 def write_estimates(folder, world, ekf, runs, key):

@@ -366,7 +366,7 @@ def score_estimates(
     measured = (info.status != Status.EMPTY).sum(axis=(1, 2))
     truth = truth._replace(missed=np.zeros((runs, shape.steps), int))
     scores = score(*thinned(stride, trace, truth, statistics, None, measured))
-    # The coordinates of its error are not known; without innovations, nor is what it measured.
+    # Neither the coordinates of its error nor the measurements that it did not use are known.
     measures = {name: value for name, value in scores.measures.items() if name != "nees_own"}
     sums = dict(scores.sums)
     if any(
@@ -378,8 +378,7 @@ def score_estimates(
     ):
         total, _ = measures["log_likelihood"]
         measures["log_likelihood"] = total, np.zeros(runs)
-    if not has_innovations:
-        del sums["measured"]
+    del sums["measured"]
     has_estimate = np.array([estimate is not None for estimate in estimates])
     return scores._replace(finite=scores.finite & has_estimate, measures=measures, sums=sums)
 
