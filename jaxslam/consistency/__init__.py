@@ -26,10 +26,13 @@ from jaxslam.consistency._recording import (
 from jaxslam.consistency._run_scores import Score, score
 from jaxslam.consistency._summary import Summary
 from jaxslam.consistency._verdict import Verdict, judge
+from jaxslam.consistency.campaign._judging import judge_estimator
+from jaxslam.consistency.campaign._run_estimates import Innovations, RunEstimate
 
 __all__ = [
     "Average",
     "ClockLag",
+    "Innovations",
     "LocalizationScores",
     "LocalizationSummary",
     "Measure",
@@ -38,6 +41,7 @@ __all__ = [
     "RecordedBlock",
     "RecordedErrors",
     "RecordingScores",
+    "RunEstimate",
     "RunScores",
     "RunStatistics",
     "Runs",
@@ -50,6 +54,7 @@ __all__ = [
     "credibility",
     "draws",
     "judge",
+    "judge_estimator",
     "judge_localization",
     "judge_recording",
     "pose_error",

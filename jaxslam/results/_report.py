@@ -72,8 +72,8 @@ def campaign_table(campaign: Campaign) -> str:
         notes.append(
             f"published: {campaign.source}; for the scenario and the filters as in the catalog"
         )
-    lines = (line for note in notes for line in textwrap.wrap(note, _WIDTH))
-    return "\n".join([title, "", text, "", *lines])
+    lines = [line for note in notes for line in textwrap.wrap(note, _WIDTH)]
+    return "\n".join([title, "", text, "", *lines, *(f"\n{note}" for note in campaign.notes)])
 
 
 def comparison_text(comparison: Comparison) -> str:
@@ -148,6 +148,7 @@ def as_json(campaign: Campaign, command: str = "", seed: int | None = None) -> s
             "autocorrelation": _finite_or_none(s.autocorrelation),
             "autocorrelation_band": _finite_or_none(s.autocorrelation_band),
             "not_finite_runs": s.not_finite_runs,
+            **({"faults": dict(s.faults)} if s.faults else {}),
             "counts": s.counts,
         }
         for name, s in campaign.filters.items()
@@ -168,6 +169,8 @@ def as_json(campaign: Campaign, command: str = "", seed: int | None = None) -> s
         "seconds": round(campaign.seconds, 3),
         "compile_seconds": round(campaign.compile_seconds, 3),
         "step_seconds": campaign.step_seconds,
+        **({"run_seconds": campaign.run_seconds} if campaign.run_seconds else {}),
+        **({"notes": campaign.notes} if campaign.notes else {}),
         "versions": versions(),
     }
     pairs = {

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from jaxslam.consistency import Summary
 from jaxslam.consistency._pairs import PairedDifference, compare_runs
+from jaxslam.consistency._summary import Summary
 from jaxslam.core._names import Named, closest_name
 from jaxslam.core._optional import loading
 from jaxslam.core.types import Estimate, Truth
@@ -53,6 +53,12 @@ class Campaign:
     reference: str = ""
     """the filter with which table, page and files compare every other, in pairs; "": none.
     `dataclasses.replace(campaign, reference="ekf")` sets it, and `--compare`"""
+    run_seconds: dict[str, float] = field(default_factory=dict)
+    """Wall time of a run, by the name of an estimator that is called or started once a run: the
+    median, with its start."""
+    notes: tuple[str, ...] = ()
+    """texts below the table, of several lines each, as the traceback of an estimator's first
+    failure"""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "filters", Named(self.filters))

@@ -3,8 +3,8 @@
 import numpy as np
 
 from jaxslam.consistency._recording import COMPONENTS, RecordingScores
-from jaxslam.core._validation import check_record
 from jaxslam.core.logs._streams import is_gap
+from jaxslam.core.validation import instance_of, refusals_of, require
 from jaxslam.results.plot._style import (
     COLORS,
     CURVE,
@@ -28,7 +28,8 @@ def recording_figure(scores: RecordingScores, *, title: str = "", width: float =
 
     scores: of `consistency.judge_recording`. Lines are broken where poses are missing.
     """
-    check_record("recording_figure", "the first argument", scores, RecordingScores)
+    with refusals_of("recording_figure"):
+        require("scores", scores, instance_of(RecordingScores))
     errors = scores.errors
     breaks = np.flatnonzero(is_gap(errors.time)) + 1
     time = np.insert(errors.time - errors.time[0], breaks, np.nan)
