@@ -43,6 +43,7 @@ from jaxslam.core.validation import (
     instance_of,
     or_none,
     prng_key,
+    refusals_of,
     require,
 )
 from jaxslam.simulation._worlds import World, with_positions
