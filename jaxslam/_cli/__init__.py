@@ -13,7 +13,7 @@ from typing import Any, NoReturn
 import jax
 from threadpoolctl import threadpool_limits
 
-from jaxslam._cli import cache, optimize, verify
+from jaxslam._cli import cache, judge, optimize, verify
 from jaxslam._cli.campaigns import consistency
 from jaxslam._cli.common import INTERRUPTED, CompileClock, as_folders, set_device_count
 from jaxslam._cli.environment import environment_text
@@ -37,6 +37,15 @@ COMMANDS = {
         "they claim. Prints a table and writes JSON, CSV and figures. The exit status is 1 if a "
         "filter is not finite, or its covariance not valid, in over 5 % of the runs or steps; "
         "verdicts do not change it.",
+    ),
+    "judge": (
+        judge,
+        "judge estimators in any language by the draws of a campaign",
+        "Compare the estimates of your own program, in any language, with the truth of `jaxslam "
+        "draws`, by the tests of `jaxslam consistency`, and run filters of the library on the same "
+        "draws. Prints a table and writes JSON, CSV, figures and a page. The exit status is 1 if "
+        "an estimator has no finite estimate, or its covariance is not valid, in over 5 % of the "
+        "runs or steps; verdicts do not change it.",
     ),
     "run": (
         run,

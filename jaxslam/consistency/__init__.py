@@ -17,13 +17,17 @@ from jaxslam.consistency._measures.nees import block_nees, pose_error
 from jaxslam.consistency._run_scores import Score, score
 from jaxslam.consistency._summary import Summary
 from jaxslam.consistency._verdict import Verdict, judge
+from jaxslam.consistency.campaign._judging import judge_estimator
+from jaxslam.consistency.campaign._run_estimates import Innovations, RunEstimate
 
 __all__ = [
     "Average",
+    "Innovations",
     "LocalizationScores",
     "LocalizationSummary",
     "Measure",
     "Nees",
+    "RunEstimate",
     "RunScores",
     "RunStatistics",
     "Runs",
@@ -35,6 +39,7 @@ __all__ = [
     "covering_level",
     "credibility",
     "judge",
+    "judge_estimator",
     "judge_localization",
     "pose_error",
     "posterior_bound",

@@ -75,6 +75,9 @@ class Summary:
     precision of the arithmetic decides"""
     honest_nis: float = 1.0
     """nis_per_dof from here on up to 1 is honest: below 1 where a gate dropped measurements"""
+    faults: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
+    """numbers of the runs without a judged estimate, by reason, as "ends early": of an estimator
+    from elsewhere (`judge_estimator`), all of `not_finite_runs`"""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "measures", Named(self.measures))

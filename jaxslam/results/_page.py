@@ -203,7 +203,8 @@ def verdict_list(campaign: Campaign) -> str:
         items.append(f"<li>{label}{badge(summary.verdict, summary)}{lines}</li>")
     lost = (f"{name} {phrase}" for name, phrase in table.lost_runs(campaign))
     sentences = [*report.sentences_on_verdicts(campaign), *lost]
-    notes = (f'<p class="note">{escape(sentence)}.</p>' for sentence in sentences)
+    notes = [f'<p class="note">{escape(sentence)}.</p>' for sentence in sentences]
+    notes += [f"<pre>{escape(text)}</pre>" for text in campaign.notes]
     return "\n".join(['<ul class="verdicts">', *items, "</ul>", *notes])
 
 

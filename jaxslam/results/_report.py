@@ -60,8 +60,8 @@ def campaign_table(campaign: Campaign) -> str:
         notes.append(
             f"published: {campaign.source}; for the scenario and the filters as in the catalog"
         )
-    lines = (line for note in notes for line in textwrap.wrap(note, _WIDTH))
-    return "\n".join([title, "", text, "", *lines])
+    lines = [line for note in notes for line in textwrap.wrap(note, _WIDTH)]
+    return "\n".join([title, "", text, "", *lines, *(f"\n{note}" for note in campaign.notes)])
 
 
 def sentences_on_verdicts(campaign: Campaign) -> list[str]:
@@ -119,6 +119,7 @@ def as_json(campaign: Campaign, command: str = "", seed: int | None = None) -> s
             "autocorrelation": _finite_or_none(s.autocorrelation),
             "autocorrelation_band": _finite_or_none(s.autocorrelation_band),
             "not_finite_runs": s.not_finite_runs,
+            **({"faults": dict(s.faults)} if s.faults else {}),
             "counts": s.counts,
         }
         for name, s in campaign.filters.items()
@@ -139,6 +140,8 @@ def as_json(campaign: Campaign, command: str = "", seed: int | None = None) -> s
         "seconds": round(campaign.seconds, 3),
         "compile_seconds": round(campaign.compile_seconds, 3),
         "step_seconds": campaign.step_seconds,
+        **({"run_seconds": campaign.run_seconds} if campaign.run_seconds else {}),
+        **({"notes": campaign.notes} if campaign.notes else {}),
         "versions": versions(),
     }
     return json_text(head | {"filters": filters})

@@ -124,6 +124,10 @@ def rows_of(campaign: Campaign, names: Sequence[str]) -> list[Row]:
     if any(times):
         figures = [None if t is None else Figure(f"{1e6 * t:.3g}", 1e6 * t) for t in times]
         rows.append(Row("time of a step [µs]", "", figures, group="Time and counts"))
+    runs = [campaign.run_seconds.get(name) for name in names]
+    if any(runs):
+        figures = [None if t is None else Figure(f"{t:.3g}", t) for t in runs]
+        rows.append(Row("wall time of a run [s]", "", figures, group="Time and counts"))
     for key in dict.fromkeys(key for s in summaries for key in s.counts):
         numbers = [s.counts.get(key) for s in summaries]
         if key not in _NEVER and (key in _ALWAYS or any(numbers)):
@@ -167,11 +171,18 @@ def notes_on(campaign: Campaign) -> list[tuple[str, str]]:
 
 
 def lost_runs(campaign: Campaign) -> list[tuple[str, str]]:
-    """The filters that were not finite in some runs, each with a phrase that lists the runs."""
+    """The filters that were not finite in some runs, or for another reason have no judged estimate
+    there, each with a phrase that lists the runs."""
     phrases = []
     for name, summary in campaign.filters.items():
-        lost = summary.not_finite_runs
-        if lost:
-            numbers = ", ".join(map(str, lost[:20])) + (", …" if len(lost) > 20 else "")
-            phrases.append((name, f"was not finite in runs {numbers}"))
+        if summary.faults:
+            reasons = (f"{why} in runs {_listed(runs)}" for why, runs in summary.faults.items())
+            phrases.append((name, f"is not judged in some runs: {'; '.join(reasons)}"))
+        elif summary.not_finite_runs:
+            phrases.append((name, f"was not finite in runs {_listed(summary.not_finite_runs)}"))
     return phrases
+
+
+def _listed(numbers: Sequence[int]) -> str:
+    """The first twenty numbers of runs."""
+    return ", ".join(map(str, numbers[:20])) + (", …" if len(numbers) > 20 else "")

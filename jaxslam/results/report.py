@@ -4,10 +4,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jaxslam.core.types import Estimate
+from jaxslam.core.types import Estimate, Info, Status
 from jaxslam.results._files import csv_text
 
-__all__ = ["map_csv", "trajectory_csv", "trajectory_tum"]
+__all__ = ["innovations_csv", "map_csv", "trajectory_csv", "trajectory_tum"]
 
 
 def trajectory_csv(time: np.ndarray, estimate: Estimate) -> str:
@@ -18,10 +18,8 @@ def trajectory_csv(time: np.ndarray, estimate: Estimate) -> str:
     values = np.concatenate(
         [np.asarray(time)[:, None], np.asarray(estimate.pose), triangle], axis=1
     )
-    # Time may be an epoch, which needs 17 digits; nine suffice for the rest.
-    return csv_text(
-        header, [[f"{row[0]:.17g}", *(f"{value:.9g}" for value in row[1:])] for row in values]
-    )
+    # 17 digits: a NEES of the file is that of the filter, and time may be an epoch.
+    return csv_text(header, [[f"{value:.17g}" for value in row] for row in values])
 
 
 def trajectory_tum(time: np.ndarray, estimate: Estimate) -> str:
@@ -44,5 +42,39 @@ def map_csv(estimate: Estimate, names: Sequence[int | str]) -> str:
         values = [*np.asarray(estimate.points[i]), cov[0, 0], cov[0, 1], cov[1, 1]]
         tag = int(estimate.tag[i])
         name = str(names[tag]) if tag >= 0 else ""  # without a tag it has no name
-        rows.append([name, *(f"{value:.9g}" for value in values)])
+        rows.append([name, *(f"{value:.17g}" for value in values)])
     return csv_text(["landmark", "x", "y", "c_xx", "c_xy", "c_yy"], rows)
+
+
+def innovations_csv(
+    time: np.ndarray,
+    tag: np.ndarray,
+    info: Info,
+    names: Sequence[int | str],
+    measurements: Sequence[str],
+) -> str:
+    """Innovations as CSV: per measurement of a landmark in the map its time, the name of the
+    landmark, ν, the upper triangle of S, whether the gate dropped it, its NIS (given those before
+    it in a joint update), and the log-likelihood of its scan, at the first of the scan.
+
+    Args:
+        time: (T,)
+        tag: (T, M) of `Log.scan`; the name of a measurement without a tag is empty.
+        info: with leading T.
+        names: of the landmarks with tags 0, 1, …
+        measurements: names of the Z numbers of a measurement.
+    """
+    status, tag, log_likelihood = map(np.asarray, (info.status, tag, info.log_likelihood))
+    nu, S, nis = map(np.asarray, (info.innovation, info.innovation_cov, info.nis))
+    upper = np.triu_indices(nu.shape[2])
+    labels = [name.partition("[")[0].strip() for name in measurements]
+    header = ["time", "tag", *(f"nu_{label}" for label in labels)]
+    header += [f"s_{labels[i]}_{labels[j]}" for i, j in zip(*upper, strict=True)]
+    rows, scan = [], -1
+    for t, m in np.argwhere((status == Status.FUSED) | (status == Status.REJECTED)):
+        of_scan = log_likelihood[t] if t != scan else 0.0
+        scan = t
+        numbers = [*nu[t, m], *S[t, m][upper], status[t, m] == Status.REJECTED, nis[t, m], of_scan]
+        name = str(names[tag[t, m]]) if tag[t, m] >= 0 else ""
+        rows.append([f"{time[t]:.17g}", name, *(f"{float(value):.17g}" for value in numbers)])
+    return csv_text([*header, "rejected", "nis", "log_likelihood"], rows)

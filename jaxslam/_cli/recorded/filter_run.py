@@ -40,10 +40,12 @@ def run_filter(
     filter: Filter,
     data: Dataset,
     film_steps: Int[np.ndarray, "F"] | None = None,
+    innovations: bool = False,
 ) -> FilterRun:
     """Run one filter over a data set; the covariance is checked if the state has P.
 
     film_steps: the steps whose whole estimates are kept for a film; None without one.
+    innovations: whether the infos are kept (`PiecewiseRun.kept`).
     """
     from jaxslam.results import plot  # matplotlib is slow to load
 
@@ -66,6 +68,7 @@ def run_filter(
             else None,
             at=film_steps,
             watch=plot.probe,
+            keep=(lambda info: info._replace(extra=None)) if innovations else (lambda info: None),
         )
     seconds = time.perf_counter() - began
     map_cov, constants = joint_map_cov(filter, result.final), ""

@@ -70,6 +70,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         metavar="METHOD",
         help=f"one of: {', '.join(METHODS)} (default: that of the reader, mostly known)",
     )
+    parser.add_argument(
+        "--innovations",
+        action="store_true",
+        help="also write innovations.csv, as jaxslam judge reads it: each innovation with its "
+        "covariance",
+    )
     add_figures(parser, FORMATS)
     add_animate(parser, "of each filter")
     cache.add_options(parser)
@@ -86,6 +92,8 @@ class RunPlan:
     filters: Mapping[str, Filter]
     animate: bool = False
     """whether whole estimates are kept for films"""
+    innovations: bool = False
+    """whether innovations are kept for a file"""
 
     @classmethod
     def from_options(cls, options: argparse.Namespace) -> "RunPlan":
@@ -99,7 +107,9 @@ class RunPlan:
                 f"--robot: expected none, since this data set has one robot, got {options.robot}"
             )
         data = with_options(reader(options.path, *robot), options)
-        return cls(data, chosen_filters(data, options.filters), options.animate)
+        return cls(
+            data, chosen_filters(data, options.filters), options.animate, options.innovations
+        )
 
 
 def run_dataset(options: argparse.Namespace, command: str) -> int:
@@ -120,7 +130,8 @@ def run_filters(plan: RunPlan) -> dict[str, FilterRun]:
     data = plan.data
     film_steps = frame_steps(data.steps, time=data.time) if plan.animate else None
     return {
-        name: run_filter(name, filter, data, film_steps) for name, filter in plan.filters.items()
+        name: run_filter(name, filter, data, film_steps, plan.innovations)
+        for name, filter in plan.filters.items()
     }
 
 
@@ -172,6 +183,14 @@ def write_runs(
         files[f"trajectory{suffix}.csv"] = report.trajectory_csv(data.time, run.result.path)
         files[f"trajectory{suffix}.tum"] = report.trajectory_tum(data.time, run.result.path)
         files[f"map{suffix}.csv"] = report.map_csv(run.result.last, data.tags)
+        if plan.innovations:
+            files[f"innovations{suffix}.csv"] = report.innovations_csv(
+                data.time,
+                np.asarray(data.log.scan.tag),
+                run.result.kept,
+                data.tags,
+                data.sensor.measurements,
+            )
     files[SUMMARY] = json_text(summary | {"versions": versions()})
     drawings: Drawings = {"map": lambda: _figure(data, runs, formats)}
     if plan.animate:

@@ -12,9 +12,10 @@ import numpy as np
 from jax.sharding import NamedSharding
 from jaxtyping import Float, PyTree
 
-from jaxslam.consistency import score
 from jaxslam.consistency._bound import final_covariance
 from jaxslam.consistency._measures import REGISTRY
+from jaxslam.consistency._measures.measure import RunStatistics
+from jaxslam.consistency._run_scores import score
 from jaxslam.consistency._tally import FAR, condense, condensed_sums
 from jaxslam.consistency.campaign._block_programs import (
     RUN_AXES,
@@ -54,6 +55,8 @@ class CampaignPlan:
     """compute the conditional Cramér-Rao bound of every run"""
     dtype: np.dtype | None = None
     """dtype of the worlds; None for JAX's default"""
+    every: int = 1
+    """k: steps k, 2k, …, T are judged; a divisor of T"""
 
     @property
     def wide(self) -> int:
@@ -167,19 +170,31 @@ class BlockRunner:
         rounding = 1000 * float(jnp.finfo(dtype).eps) * reach
         return np.asarray(max(FAR * max(variance, 0.0) ** 0.5, rounding), dtype)
 
+    def draws(self, first: int, runs: int) -> Draws:
+        """The truth and the logs (R, …) of runs first … first + runs - 1, all within a block, on
+        the host."""
+        numbers, wanted = self._place(first, runs)
+        draws = jax.device_get(self.programs.draw(self._world, self._key, numbers))
+        of_runs: Draws = jax.tree.map(lambda leaf: leaf[wanted], draws)
+        return of_runs
+
+    def _place(self, first: int, runs: int) -> tuple[np.ndarray, slice]:
+        """The numbers (B,) of the runs of a block, and where some of its runs are among them."""
+        # The number of a run sets its place in a block, in any piece: the same bits.
+        base = first // self.plan.wide * self.plan.wide
+        return self._numbers(base), slice(first - base, first - base + runs)
+
     def block(self, first: int, runs: int) -> BlockResult:
         """The result of runs first … first + runs - 1, all within a block."""
         plan, (draw, drive, bound, _) = self.plan, self.programs
-        # The number of a run sets its place in a block, in any piece: the same bits.
-        base = first // plan.wide * plan.wide
-        wanted = slice(first - base, first - base + runs)
-        numbers = self._numbers(base)
+        numbers, wanted = self._place(first, runs)
         draws: Draws = jax.block_until_ready(draw(self._world, self._key, numbers))
         truth = jax.device_get(draws[0])
         valid = np.asarray(jax.device_get(draws[1].scan.valid))
         measured = valid.reshape(len(valid), -1).sum(axis=1)
         scores: dict[str, dict[str, np.ndarray]] = {}
         run_0, seconds = {}, {}
+        judged = slice(plan.every - 1, None, plan.every)
         for name, candidate in self._filters.items():
             began = time.perf_counter()
             results: FilterResults = jax.block_until_ready(
@@ -188,21 +203,74 @@ class BlockRunner:
             seconds[name] = (time.perf_counter() - began) / plan.block
             if first == 0:
                 run_0[name] = (
-                    jax.tree.map(lambda leaf: leaf[0], truth),
-                    jax.tree.map(lambda leaf: first_run(leaf, 1), results.estimate),
+                    rows_of_truth(jax.tree.map(lambda leaf: leaf[0], truth), judged),
+                    jax.tree.map(lambda leaf: first_run(leaf, 1)[judged], results.estimate),
                 )
             statistics = jax.device_get(
                 self._statistics(self._world.sensor, draws[0], results.estimate, results.info)
             )
             chart_error = np.swapaxes(jax.device_get(results.chart_error), 0, 1)
             by_run = _on_host(results), truth, statistics, chart_error, measured
-            score_of_runs = score(*jax.tree.map(lambda leaf: leaf[wanted], by_run))
+            score_of_runs = score(
+                *thinned(*jax.tree.map(lambda leaf: leaf[wanted], by_run), plan.every)
+            )
             scores[name] = condense(score_of_runs, first, float(self._limit))
         scores[BOUND] = {"limit": self._limit}
         if plan.bound:
             variances = jax.device_get(bound(self._world, self._key, numbers, *draws))
-            scores[BOUND] |= condensed_sums({n: rows[wanted] for n, rows in variances.items()})
+            scores[BOUND] |= condensed_sums(
+                {n: rows[wanted, plan.every - 1 :: plan.every] for n, rows in variances.items()}
+            )
         return BlockResult(scores, run_0, seconds, self.compile_seconds)
+
+
+def thinned(
+    trace: Trace,
+    truth: Truth,
+    statistics: RunStatistics,
+    chart_error: np.ndarray | None,
+    measured: np.ndarray,
+    every: int,
+) -> tuple[Trace, Truth, RunStatistics, np.ndarray | None, np.ndarray]:
+    """The arguments of `score` at steps k, 2k, …, T of R runs; k is `every`.
+
+    Measurements are none of a step alone: those of k steps are put side by side.
+    """
+    if every == 1:
+        return trace, truth, statistics, chart_error, measured
+    at = np.s_[:, every - 1 :: every]
+
+    def of_windows(leaf: np.ndarray) -> np.ndarray:
+        # (R, T, M) -> (R, T/k, k M)
+        return leaf.reshape(len(leaf), leaf.shape[1] // every, -1)
+
+    estimate, info = trace.estimate, trace.info
+    by_window = {name: of_windows(getattr(info, name)) for name in ("nis", "dof", "status")}
+    log_likelihood = of_windows(np.asarray(info.log_likelihood)).sum(axis=2, dtype=np.float64)
+    values = {
+        name: value[at] if isinstance(value, np.ndarray) and value.ndim == 2 else value
+        for name, value in statistics.values.items()
+    }
+    return (
+        trace._replace(
+            estimate=estimate._replace(pose=estimate.pose[at], pose_cov=estimate.pose_cov[at]),
+            info=info._replace(log_likelihood=log_likelihood, **by_window),
+            probe=None if trace.probe is None else trace.probe[at],
+        ),
+        truth._replace(pose=truth.pose[at]),
+        statistics._replace(
+            landmark_nees=statistics.landmark_nees[at],
+            regular_landmarks=statistics.regular_landmarks[at],
+            values=values,
+        ),
+        None if chart_error is None else chart_error[at],
+        measured,
+    )
+
+
+def rows_of_truth(truth: Truth, rows: slice) -> Truth:
+    """The truth of one run at some of its steps."""
+    return truth._replace(pose=truth.pose[rows], missed=truth.missed[rows])
 
 
 def first_run(leaf: jax.Array, axis: int = 0) -> np.ndarray:

@@ -31,8 +31,8 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from jaxslam._driver import run
 from jaxslam.charts import Euclidean
-from jaxslam.consistency import Measure, RunStatistics, conditional_bound
-from jaxslam.consistency._bound import jacobians_at_truth
+from jaxslam.consistency._bound import conditional_bound, jacobians_at_truth
+from jaxslam.consistency._measures.measure import Measure, RunStatistics
 from jaxslam.consistency._measures.nees import chart_error_of
 from jaxslam.consistency._measures.observability import monitor_of
 from jaxslam.consistency._run_scores import run_statistics

@@ -18,8 +18,7 @@ import numpy as np
 from jax.typing import DTypeLike
 
 from jaxslam._origin import far_origin, may_move, moved, returned
-from jaxslam.consistency import Summary
-from jaxslam.consistency._summary import summarize
+from jaxslam.consistency._summary import Summary, summarize
 from jaxslam.consistency._tally import Tally
 from jaxslam.consistency.campaign._block import BOUND, CampaignPlan
 from jaxslam.consistency.campaign._block_programs import fitting_block
@@ -129,7 +128,7 @@ def monte_carlo(
         names = (*filters, BOUND)
         tallies = {name: Tally() for name in names}
         size = int(block or fitting_block(scenario, filters, devices[0]))
-        near, near_filters, origin = _near_the_origin(scenario, filters)
+        near, near_filters, origin = near_the_origin(scenario, filters)
         plan = CampaignPlan(near, near_filters, key, devices, size, bound, dtype)
         if part is not None and (part[0] - 1) * plan.wide >= runs:
             raise ValueError(
@@ -154,7 +153,7 @@ def monte_carlo(
         campaign = None
         if tallies[BOUND].pieces():
             seconds = time.perf_counter() - began
-            campaign = _summed_up(plan, tallies, work, origin, seconds, compare=stop is None)
+            campaign = summed_up(plan, tallies, work, origin, seconds, compare=stop is None)
         if isinstance(stop, Incomplete):
             done = f"{campaign.runs if campaign else 0} of {runs} runs done"
             raise Incomplete(f"monte_carlo: executor: {stop}; {done}", campaign) from stop.__cause__
@@ -241,7 +240,7 @@ def summaries_of(tallies: dict[str, Tally]) -> tuple[int, np.ndarray, dict[str, 
     return finished, tallies[BOUND].first("limit"), summaries
 
 
-def _summed_up(
+def summed_up(
     plan: CampaignPlan,
     tallies: dict[str, Tally],
     work: Work,
@@ -266,7 +265,7 @@ def _summed_up(
         scenario=scenario.name,
         source=scenario.source,
         published={name: dict(values) for name, values in scenario.published.items()},
-        steps=scenario.steps,
+        steps=scenario.steps // plan.every,
         runs=finished,
         dtype=str(limit.dtype),
         divergence_limit=float(limit),
@@ -285,7 +284,7 @@ def _summed_up(
     )
 
 
-def _near_the_origin(
+def near_the_origin(
     scenario: World, filters: Mapping[str, Candidate]
 ) -> tuple[World, Mapping[str, Candidate], np.ndarray | None]:
     """World and filters with positions relative to the start, and the start's (x, y) in the map.

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxslam.consistency import Summary
+from jaxslam.consistency._summary import Summary
 from jaxslam.core._names import Named
 from jaxslam.core._optional import loading
 from jaxslam.core.types import Estimate, Truth
@@ -48,6 +48,12 @@ class Campaign:
     run_numbers: np.ndarray = field(default_factory=lambda: np.arange(0))
     """(runs,) the number of each run, in the order of `Summary.per_run`; run i has key
     fold_in(key, i)"""
+    run_seconds: dict[str, float] = field(default_factory=dict)
+    """Wall time of a run, by the name of an estimator that is called or started once a run: the
+    median, with its start."""
+    notes: tuple[str, ...] = ()
+    """texts below the table, of several lines each, as the traceback of an estimator's first
+    failure"""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "filters", Named(self.filters))

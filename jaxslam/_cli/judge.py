@@ -1,0 +1,189 @@
+"""The command `jaxslam judge`: estimators of any kind, judged on the draws of `jaxslam draws`."""
+
+import argparse
+import re
+import sys
+from pathlib import Path
+
+import jax
+
+from jaxslam._cli import cache
+from jaxslam._cli.campaigns.estimator_runs import Programs
+from jaxslam._cli.common import FAILED, add_figures, add_out, check_out, chosen_devices
+from jaxslam._cli.user_objects import UserObjects
+from jaxslam.consistency._verdict import is_faulty
+from jaxslam.consistency.campaign._judging import judge_sources
+from jaxslam.consistency.campaign._pieces import cores
+from jaxslam.consistency.campaign._run_estimates import RunFault
+from jaxslam.core._numbers import check_count
+from jaxslam.datasets._judged_folders import DrawsFolder, folder_source, read_draws, run_name
+from jaxslam.results import _campaign_files as campaign_files
+from jaxslam.results._campaign_files import FORMATS
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `jaxslam judge`."""
+    # A recorded robot: the options of `_cli.recorded.judge_recording.add_arguments` belong here.
+    parser.add_argument(
+        "estimates",
+        nargs="*",
+        metavar="ESTIMATES",
+        help="folders of estimates, one for each estimator: ESTIMATES/0000/trajectory.csv is of "
+        "run 0000, and so on, as `jaxslam run` writes it; map.csv and innovations.csv are optional",
+    )
+    parser.add_argument(
+        "--draws", metavar="DIR", help="the folder of `jaxslam draws` that was estimated"
+    )
+    parser.add_argument(
+        "--estimator",
+        metavar="COMMAND",
+        help="run this program first, once for each run without an estimate, as './my_filter {run} "
+        "{estimate}': {run} is the folder of the run, {estimate} an empty folder for its estimate",
+    )
+    parser.add_argument(
+        "--time-limit",
+        type=float,
+        metavar="SECONDS",
+        help="time after which the program of a run is killed (default: none)",
+    )
+    parser.add_argument(
+        "--processes",
+        type=int,
+        metavar="N",
+        help="programs that run at once (default: as many as cores)",
+    )
+    parser.add_argument(
+        "--filters",
+        default="",
+        help="filters of the library as further columns on the same draws, as in jaxslam "
+        "consistency; comma-separated (default: none)",
+    )
+    parser.add_argument(
+        "--every",
+        type=int,
+        default=1,
+        metavar="K",
+        help="judge each K-th step alone, where an estimator writes fewer rows; of filters, too "
+        "(default: 1)",
+    )
+    parser.add_argument("--runs", type=int, help="judge the first runs alone (default: all)")
+    parser.add_argument(
+        "--bound",
+        action="store_true",
+        help="also compute the Cramér-Rao bound conditional on each true trajectory",
+    )
+    add_out(parser)
+    add_figures(parser, FORMATS, "; the page always has its own")
+    parser.add_argument(
+        "--devices", default="all", help='"all", a number, or a platform: cpu, gpu (default: all)'
+    )
+    cache.add_options(parser)
+    parser.set_defaults(command=run_judge)
+
+
+def run_judge(options: argparse.Namespace, command: str) -> int:
+    """Judge estimates, print the table and write its files; returns the exit status.
+
+    It is 1 where an estimator or a filter is faulty, as not finite (`is_faulty`), or a figure
+    cannot be drawn; a verdict does not change it.
+    """
+    # A recorded robot: with --estimate or --truth, `_cli.recorded.judge_recording.run(options)`.
+    return _judge_estimates(options, command)
+
+
+def _judge_estimates(options: argparse.Namespace, command: str) -> int:
+    """Judge folders of estimates of a folder of draws."""
+    jax.config.update("jax_enable_x64", True)
+    formats = campaign_files.check_figure_formats("--figures", options.figures.split(","))
+    if not options.estimates:
+        raise ValueError("ESTIMATES: expected a folder of estimates, got none")
+    if options.draws is None:
+        raise ValueError("--draws: expected the folder of `jaxslam draws`, got none")
+    folders = _named([Path(folder) for folder in options.estimates])
+    draws = read_draws(Path(options.draws))
+    runs = draws.runs if options.runs is None else options.runs
+    for name in ("runs", "every", "processes"):
+        if (count := getattr(options, name)) is not None:
+            check_count(f"--{name}", count)
+    if runs > draws.runs:
+        raise ValueError(f"--runs: expected at most {draws.runs}, as {options.draws} has")
+    if options.time_limit is not None and not options.time_limit > 0:
+        raise ValueError(f"--time-limit: expected seconds above 0, got {options.time_limit:g}")
+    user = UserObjects()
+    world = user.scenario(draws.scenario, draws.steps)
+    if world.steps % options.every:
+        raise ValueError(
+            f"--every: expected a divisor of the {world.steps} steps, got {options.every}"
+        )
+    filters = user.filters(options.filters, world) if options.filters.strip() else {}
+    if twice := [name for name in folders if name in filters]:
+        raise ValueError(
+            f"ESTIMATES: {twice[0]} is the name of a filter: expected a folder of another name"
+        )
+    devices = chosen_devices(options.devices)
+    check_out(options.out, "judge")
+    failures: dict[int, RunFault] = {}
+    if options.estimator is not None:
+        if len(folders) > 1:
+            raise ValueError(f"--estimator: expected one folder of estimates, got {len(folders)}")
+        (folder,) = folders.values()
+        program = Programs(options.estimator, draws.path, folder, options.time_limit)
+        failures = program.run(range(runs), options.processes or cores())
+    for folder in folders.values():
+        _check_folder(folder, draws, bool(failures))
+    with user.located_errors():
+        campaign = judge_sources(
+            world,
+            {
+                name: folder_source(
+                    folder, draws, world.sensor.measurements, options.every, failures
+                )
+                for name, folder in folders.items()
+            },
+            runs,
+            draws.key,
+            filters=filters,
+            every=options.every,
+            bound=options.bound,
+            devices=devices,
+        )
+    print(campaign)
+    failed: list[str] = []
+    paths = campaign_files.save_campaign(
+        campaign, options.out, formats, True, command, None, failed.append
+    )
+    print("\nwrote " + ", ".join(map(str, paths)))
+    for sentence in failed:
+        print(f"jaxslam: {sentence}", file=sys.stderr)
+    is_wrong = any(is_faulty(summary.counts) for summary in campaign.filters.values())
+    return FAILED if is_wrong or failed else 0
+
+
+def _named(folders: list[Path]) -> dict[str, Path]:
+    """Folders by their names, which name the columns of the table."""
+    named: dict[str, Path] = {}
+    for folder in folders:
+        name = folder.resolve().name
+        if name in named:
+            raise ValueError(
+                f"ESTIMATES: expected folders of different names, got {named[name]} and {folder}"
+            )
+        named[name] = folder
+    return named
+
+
+def _check_folder(folder: Path, draws: DrawsFolder, may_be_empty: bool) -> None:
+    """Raise ValueError on a folder without the estimate of a run, and on runs without draws."""
+    names = {run_name(number) for number in range(draws.runs)}
+    content = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
+    if further := sorted(n for n in content - names if re.fullmatch(r"\d{4,}", n, re.ASCII)):
+        raise ValueError(
+            f"{folder / further[0]}: {draws.path} has runs {run_name(0)} to "
+            f"{run_name(draws.runs - 1)} alone"
+        )
+    if not content & names and not may_be_empty:
+        what = "holds no estimate" if folder.is_dir() else "is no folder"
+        raise ValueError(
+            f"{folder} {what}: expected {run_name(0)}/trajectory.csv, and so on, for each run of "
+            f"{draws.path}"
+        )

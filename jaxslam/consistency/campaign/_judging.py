@@ -1,0 +1,364 @@
+"""Estimators from elsewhere, judged on the draws of a campaign, beside filters of the library."""
+
+import contextlib
+import time
+import traceback
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from types import MappingProxyType
+from typing import Any, Literal, NamedTuple
+
+import jax
+import numpy as np
+
+from jaxslam._origin import returned
+from jaxslam.consistency._run_scores import Score
+from jaxslam.consistency._summary import Summary
+from jaxslam.consistency._tally import Tally, condense
+from jaxslam.consistency.campaign._block import BOUND, BlockRunner, CampaignPlan, rows_of_truth
+from jaxslam.consistency.campaign._block_programs import fitting_block
+from jaxslam.consistency.campaign._candidates import check_fits, check_noise
+from jaxslam.consistency.campaign._harness import near_the_origin, summed_up
+from jaxslam.consistency.campaign._pieces import missing_pieces
+from jaxslam.consistency.campaign._progress import Progress
+from jaxslam.consistency.campaign._result import Campaign
+from jaxslam.consistency.campaign._run_estimates import (
+    NOT_FINITE,
+    RunEstimate,
+    RunFault,
+    as_estimate,
+    checked,
+    estimate_of_run,
+    score_estimates,
+    shape_of,
+)
+from jaxslam.consistency.campaign._work import Work, show_progress
+from jaxslam.core._numbers import check_count, check_key, is_concrete
+from jaxslam.core._validation import check_record
+from jaxslam.core.protocols import Candidate
+from jaxslam.core.types import Estimate, Log, Truth
+from jaxslam.core.validation import InvalidField
+from jaxslam.simulation._worlds import World, with_positions
+
+_LISTED = 3
+"""Runs of which a doubt has the details."""
+
+_FAULTS_OF_COV = {"asymmetric_steps": "not symmetric", "indefinite_steps": "not positive definite"}
+
+
+class Outcome(NamedTuple):
+    """What an estimator makes of one run."""
+
+    truth: Truth
+    """what its estimate is compared with"""
+    estimate: RunEstimate | None
+    fault: RunFault | None = None
+    seconds: float | None = None
+    """wall time; None where it is not known"""
+
+
+Source = Callable[[int, Truth, Log], Outcome]
+"""function of the number of a run, its truth and its log, on the host"""
+
+
+def judge_estimator(
+    world: World,
+    function: Callable[[Log], Any],
+    runs: int,
+    key: jax.Array,
+    *,
+    filters: Mapping[str, Candidate] = MappingProxyType({}),
+    name: str = "estimator",
+    every: int = 1,
+    bound: bool = False,
+    block: int | None = None,
+    devices: Sequence[jax.Device] | None = None,
+    progress: Callable[[int, int], None] | Literal[False] | None = None,
+) -> Campaign:
+    """Judge an estimator of your own, in plain Python, as `monte_carlo` judges filters.
+
+        def my_filter(log):
+            ...                                  # NumPy, or what you like
+            return poses, covs                   # (T, 3) and (T, 3, 3)
+
+        print(judge_estimator(world, my_filter, 50, jax.random.key(0), filters={"ekf": ekf}))
+
+    The function is called once for each run, one after the other. Its log has NumPy arrays: control
+    (T, U), and scan with z (T, M, Z), tag (T, M) and valid (T, M). It returns (poses, covs), or an
+    object that has these and perhaps maps and innovations, as a `RunEstimate`. The draws are those
+    of `monte_carlo` with the same world and key.
+
+    A run is not judged if the function raises an exception, or returns too few rows, a number that
+    is not finite, or headings in degrees. Such runs are counted as not finite, by reason in
+    `Summary.faults`, and the first traceback is in `Campaign.notes`. A step whose covariance is not
+    symmetric or not positive definite has no NEES, and is counted. In a world of `spurious` data
+    maps are not judged: which landmark is meant is not known.
+
+    Args:
+        world: what to draw; see `scenarios`.
+        function: the estimator. It need not be traceable, nor use JAX.
+        runs: how many worlds; run i has key fold_in(key, i).
+        key: a PRNG key.
+        filters: of the library, on the same draws, by name; as in `monte_carlo`.
+        name: of the estimator in tables and figures.
+        every: k: steps k, 2k, …, T are judged alone, also of `filters`; a divisor of the steps T.
+            The function may return these rows alone.
+        bound, block, devices, progress: as in `monte_carlo`.
+    Returns:
+        Campaign.
+    Raises:
+        ValueError: on arguments that `monte_carlo` does not take, a name that a filter has, `every`
+            that does not divide the steps, and a result of the function of another form or shape.
+    """
+    if not callable(function) or isinstance(function, type):
+        raise InvalidField(
+            "judge_estimator", "function", f"expected a function of the log, got {function!r:.60}"
+        )
+
+    def outcome_of(number: int, truth: Truth, log: Log) -> Outcome:
+        began = time.perf_counter()
+        try:
+            value = function(log)
+        except Exception as error:
+            # Without the frame of this function.
+            error = error.with_traceback(error.__traceback__ and error.__traceback__.tb_next)
+            first_line = (str(error).strip().splitlines() or [""])[0]
+            reason = f"raises {type(error).__name__}"
+            text = "".join(traceback.format_exception(error)).rstrip()
+            return Outcome(truth, None, RunFault(reason, first_line, text))
+        seconds = time.perf_counter() - began
+        estimate = as_estimate(f"judge_estimator: {name}, run {number}", value)
+        return Outcome(truth, estimate, None, seconds)
+
+    return judge_sources(
+        world,
+        {name: outcome_of},
+        runs,
+        key,
+        filters=filters,
+        every=every,
+        bound=bound,
+        block=block,
+        devices=devices,
+        progress=progress,
+    )
+
+
+def judge_sources(
+    world: World,
+    sources: Mapping[str, Source],
+    runs: int,
+    key: jax.Array,
+    *,
+    filters: Mapping[str, Candidate],
+    every: int = 1,
+    bound: bool = False,
+    block: int | None = None,
+    devices: Sequence[jax.Device] | None = None,
+    progress: Callable[[int, int], None] | Literal[False] | None = None,
+) -> Campaign:
+    """The campaign of estimators from elsewhere, by name, and of filters; see `judge_estimator`."""
+    with jax.transfer_guard("allow"):
+        _check(world, sources, runs, key, filters, every, block)
+        began, runs = time.perf_counter(), int(runs)
+        devices = jax.local_devices() if devices is None else list(devices)
+        size = int(block or (fitting_block(world, filters, devices[0]) if filters else 16))
+        near, near_filters, origin = near_the_origin(world, filters)
+        plan = CampaignPlan(near, near_filters, key, devices, size, bound, None, every)
+        pieces = missing_pieces([], runs, plan.wide)
+        judged = _judge_pieces(plan, sources, pieces, origin, progress)
+        # The filters, and with them the limit of accuracy, which needs the world alone.
+        work = Work(2, None, progress or None, {n: Tally() for n in (*filters, BOUND)})
+        with show_progress(work, plan, progress is None and bool(filters)):
+            work.compute(plan, pieces)
+        limit = float(work.tallies[BOUND].first("limit"))
+        tallies = {name: Tally() for name in sources} | work.tallies
+        for name, estimator in judged.items():
+            for (first, count), scores in zip(pieces, estimator.scores, strict=True):
+                tallies[name].add(first, count, condense(scores, first, limit))
+        campaign = summed_up(plan, tallies, work, origin, time.perf_counter() - began, compare=True)
+        summaries = {
+            name: judged[name].qualify(summary, pieces) if name in judged else summary
+            for name, summary in campaign.filters.items()
+        }
+        notes = [note for name, estimator in judged.items() for note in estimator.notes(name)]
+        if every > 1:
+            notes.insert(
+                0, f"judged at {campaign.steps:,} of {world.steps:,} steps: each {every}th."
+            )
+        return replace(
+            campaign,
+            filters=summaries,
+            first={n: e.first for n, e in judged.items() if e.first is not None} | campaign.first,
+            run_seconds={n: float(np.median(e.seconds)) for n, e in judged.items() if e.seconds},
+            notes=tuple(notes),
+        )
+
+
+class _Judgement:
+    """The scores of an estimator from elsewhere, and what is wrong with its runs."""
+
+    def __init__(self) -> None:
+        self.scores: list[Score] = []
+        self.faults: dict[int, RunFault] = {}
+        self.seconds: list[float] = []
+        self.first: tuple[Truth, Estimate] | None = None
+        self.has_final_maps = False
+
+    def add(self, number: int, outcome: Outcome) -> None:
+        """Note what is wrong with a run, and its wall time."""
+        if outcome.fault is not None:
+            self.faults[number] = outcome.fault
+        if outcome.seconds is not None:
+            self.seconds.append(outcome.seconds)
+        if outcome.estimate is not None and outcome.estimate.maps is not None:
+            self.has_final_maps |= outcome.estimate.maps[2].ndim == 1
+
+    def qualify(self, summary: Summary, pieces: Sequence[tuple[int, int]]) -> Summary:
+        """The summary with the reasons for which runs are not judged, and with the numbers of the
+        runs whose covariances are none."""
+        by_reason: dict[str, list[int]] = {}
+        for number in summary.not_finite_runs:
+            fault = self.faults.get(number, RunFault(NOT_FINITE))
+            by_reason.setdefault(fault.reason, []).append(number)
+        doubts = list(summary.doubts)
+        if by_reason:
+            # In place of the doubt on runs that are not finite, which is the first.
+            doubts[0] = self._doubt(by_reason, summary.counts["runs"])
+        for name, fault_of_cov in _FAULTS_OF_COV.items():
+            numbers = [
+                first + int(i)
+                for (first, _), scores in zip(pieces, self.scores, strict=True)
+                for i in np.flatnonzero(scores.finite & (scores.sums[name] > 0))
+            ]
+            if numbers:
+                doubts.append(f"its covariance is {fault_of_cov} in {_runs_text(numbers)}")
+        faults = {reason: tuple(numbers) for reason, numbers in by_reason.items()}
+        return replace(summary, doubts=tuple(doubts), faults=faults)
+
+    def _doubt(self, by_reason: Mapping[str, Sequence[int]], rest: int) -> str:
+        """The sentence on runs that are not judged."""
+        parts = []
+        for reason, numbers in by_reason.items():
+            details = [f"run {n}: {self.faults[n].detail}" for n in numbers if n in self.faults]
+            listed = "; ".join(details[:_LISTED]) + "; …" * (len(details) > _LISTED)
+            parts.append(f"{len(numbers):,} {reason}" + f" ({listed})" * bool(listed))
+        lost = sum(map(len, by_reason.values()))
+        averages = f"averages of the {rest:,} judged runs" if rest else "there are no averages"
+        return f"{lost:,} of {lost + rest:,} runs are not judged: {', '.join(parts)}: {averages}"
+
+    def notes(self, name: str) -> list[str]:
+        """Texts below the table."""
+        notes = []
+        for number, fault in self.faults.items():
+            if fault.text:
+                notes.append(f"{name}, run {number}, the first that failed:\n{fault.text}")
+                break
+        if self.has_final_maps:
+            notes.append(f"{name}: the landmark NEES is of its final maps, without steps before.")
+        return notes
+
+
+def _judge_pieces(
+    plan: CampaignPlan,
+    sources: Mapping[str, Source],
+    pieces: Sequence[tuple[int, int]],
+    origin: np.ndarray | None,
+    progress: Callable[[int, int], None] | Literal[False] | None,
+) -> dict[str, _Judgement]:
+    """The scores of each estimator in pieces (first, runs) of a campaign."""
+    runner, judged = BlockRunner(plan), {name: _Judgement() for name in sources}
+    world, device = plan.scenario, plan.devices[0]
+    runs = sum(count for _, count in pieces)
+    title = f"{world.name}, {', '.join(sources)}"
+    with Progress(title) if progress is None else contextlib.nullcontext(progress or None) as bar:
+        for first, count in pieces:
+            truths, logs = runner.draws(first, count)
+            if np.ndim(truths.pose) != 3:
+                raise InvalidField("judge_estimator", "world", "expected a world of one robot")
+            outcomes: dict[str, list[Outcome]] = {name: [] for name in sources}
+            for i in range(count):
+                truth, log = jax.tree.map(lambda leaf, i=i: leaf[i], (truths, logs))
+                truth = truth if origin is None else returned(truth, origin)
+                shape = shape_of(log, truth, plan.every)
+                for name, source in sources.items():
+                    copied = jax.tree.map(np.copy, log)  # the estimator may write into it
+                    outcome = source(first + i, truth, copied)
+                    estimate, fault = outcome.estimate, outcome.fault
+                    if estimate is not None and fault is None:
+                        estimate, fault = checked(
+                            f"{name}, run {first + i}", estimate, outcome.truth, shape
+                        )
+                        outcome = outcome._replace(
+                            estimate=None if fault else estimate, fault=fault
+                        )
+                    judged[name].add(first + i, outcome)
+                    outcomes[name].append(outcome)
+                    if first + i == 0 and outcome.estimate is not None:
+                        judged[name].first = (
+                            rows_of_truth(
+                                with_positions(world.sensor, outcome.truth),
+                                slice(plan.every - 1, None, plan.every),
+                            ),
+                            estimate_of_run(outcome.estimate, shape),
+                        )
+                if bar is not None:
+                    bar(first + i + 1, runs)
+            for name, results in outcomes.items():
+                of_runs = jax.tree.map(
+                    lambda *leaves: np.stack(leaves), *(outcome.truth for outcome in results)
+                )
+                judged[name].scores.append(
+                    score_estimates(
+                        [outcome.estimate for outcome in results],
+                        of_runs,
+                        shape,
+                        world.sensor,
+                        device,
+                        plan.wide,
+                    )
+                )
+    return judged
+
+
+def _runs_text(numbers: Sequence[int]) -> str:
+    """The numbers of some runs."""
+    listed = ", ".join(map(str, numbers[:20])) + ", …" * (len(numbers) > 20)
+    return f"run{'s' * (len(numbers) > 1)} {listed}"
+
+
+def _check(
+    world: World,
+    sources: Mapping[str, Source],
+    runs: int,
+    key: jax.Array,
+    filters: Mapping[str, Candidate],
+    every: int,
+    block: int | None,
+) -> None:
+    """Raise ValueError on arguments that `judge_estimator` does not take."""
+    check_record("judge_estimator", "world", world, World)
+    for name, value in (("runs", runs), ("every", every), ("block", block)):
+        if value is not None:
+            check_count(f"judge_estimator: {name}", value)
+    if (most := world.recorded_runs) is not None and runs > most:
+        reason = f"expected at most {most}, the recorded runs of {world.name}, got {runs}"
+        raise InvalidField("judge_estimator", "runs", reason)
+    if world.steps % every:
+        reason = f"expected a divisor of the {world.steps} steps, got {every}"
+        raise InvalidField("judge_estimator", "every", reason)
+    check_key("judge_estimator", key)
+    if not is_concrete(key):
+        raise ValueError("judge_estimator: call it outside of jax.jit")
+    if not isinstance(filters, Mapping):
+        reason = f"expected {{name: filter}}, got a {type(filters).__name__}"
+        raise InvalidField("judge_estimator", "filters", reason)
+    for name in (*sources, *filters):
+        if not isinstance(name, str) or not name.strip() or not name.isprintable():
+            reason = f"expected a name, as 'mine', got {name!r}"
+            raise InvalidField("judge_estimator", "name", reason)
+    for name, candidate in filters.items():
+        if name in sources:
+            raise InvalidField("judge_estimator", "name", f"{name!r} is the name of a filter")
+        check_fits(name, candidate, world)
+    check_noise(world)

@@ -1,0 +1,423 @@
+"""Estimates from elsewhere: their form, what is wrong with them, and their scores.
+
+An estimate of a run becomes a `Trace` with a row at each step, whose landmark slots are the tags of
+the world. So `run_statistics` and `score` take it as they take the trace of a filter. What was not
+handed over is empty: it has no number in any run, hence no row in a table.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int, PyTree
+
+from jaxslam.consistency._measures.measure import RunStatistics
+from jaxslam.consistency._run_scores import LAGS, Score, score
+from jaxslam.consistency.campaign._block import thinned
+from jaxslam.consistency.campaign._block_programs import statistics_program
+from jaxslam.core._units import TURN
+from jaxslam.core.protocols import Sensor
+from jaxslam.core.types import Estimate, Info, Log, Status, Trace, Truth
+
+MISSING, EARLY, GAPS = "missing", "ends early", "has no estimate at some steps"
+NOT_FINITE = "not finite"
+DEGREES = "heading in degrees"
+TIMES = "has times that are not in the truth"
+"""Reasons for which a run is not judged."""
+
+
+class Innovations(NamedTuple):
+    """The J innovations of one run: of each measurement of a landmark in the map, in any order."""
+
+    rows: Int[np.ndarray, "J"]
+    """the step of each, counted from 0"""
+    tags: Int[np.ndarray, "J"]
+    """the tag of its landmark, -1 if unknown: whiteness compares innovations of one landmark"""
+    innovation: Float[np.ndarray, "J Z"]
+    """ν = z - ẑ"""
+    innovation_cov: Float[np.ndarray, "J Z Z"]
+    """S"""
+    rejected: Any = None
+    """(J,) where a gate dropped the measurement; default nowhere. Leave these in: without them a
+    gated NIS is below 1"""
+    nis: Any = None
+    """(J,) default νᵀS⁻¹ν; where a scan is fused as a whole, of each measurement given those before
+    it, so that their sum is the NIS of the scan"""
+    log_likelihood: Any = None
+    """(J,) what each adds to the log-likelihood of the run; default log N(ν; 0, S), and with `nis`
+    none"""
+
+
+class RunEstimate(NamedTuple):
+    """An estimate of one run of T steps by a program of your own: NumPy arrays, in map coordinates.
+
+    It has a row at each of the K = T steps, or at each k-th (`every`). Leave out what your
+    estimator does not have: what is made of it has no row in the table.
+    """
+
+    poses: Float[np.ndarray, "K 3"]
+    """x [m], y [m], θ [rad], after the measurements of the step"""
+    covs: Float[np.ndarray, "K 3 3"]
+    """claimed covariances of (x, y, θ)"""
+    maps: Any = None
+    """(means, covs, tags) of shapes (N, 2), (N, 2, 2), (N,) for the final map, for its RMSE and its
+    NEES at the last step; with leading K for the map at each row, for the NEES at all of them. The
+    tag of a landmark is its row in the map of the world, -1 for a place without a landmark."""
+    innovations: Any = None
+    """`Innovations`, or a tuple of their first fields, for NIS, whiteness and log-likelihood"""
+
+
+class RunFault(NamedTuple):
+    """Why a run is not judged."""
+
+    reason: str
+    """as "missing"; runs are counted by it"""
+    detail: str = ""
+    """of this run"""
+    text: str = ""
+    """a traceback, or what a program wrote to its standard error; "" without one"""
+
+
+def as_estimate(name: str, value: object) -> RunEstimate:
+    """A tuple (poses, covs), or an object with these and perhaps maps and innovations, as arrays.
+
+    Raises ValueError, which begins with a name, on anything else.
+    """
+    if hasattr(value, "poses") and hasattr(value, "covs"):
+        fields = value.poses, value.covs, getattr(value, "maps", None)
+        innovations = getattr(value, "innovations", None)
+    elif isinstance(value, tuple) and len(value) == 2:
+        fields, innovations = (*value, None), None
+    else:
+        raise ValueError(
+            f"{name}: expected (poses, covs), or an object that has these and perhaps maps and "
+            f"innovations, got {type(value).__name__}"
+        )
+    maps = fields[2]
+    poses = _array(f"{name}: poses", fields[0], ("K", 3))
+    covs = _array(f"{name}: covs", fields[1], (len(poses), 3, 3))
+    if maps is not None:
+        means, map_covs, tags = _parts(f"{name}: maps", maps, ("means", "covs", "tags"))
+        lead = (len(poses),) if np.ndim(tags) == 2 else ()
+        tags = _array(f"{name}: tags of maps", tags, (*lead, "N"))
+        count = tags.shape[-1]
+        means = _array(f"{name}: means of maps", means, (*lead, count, 2))
+        maps = means, _array(f"{name}: covs of maps", map_covs, (*lead, count, 2, 2)), _whole(tags)
+    if innovations is not None:
+        fields_of = Innovations._fields
+        count = len(innovations) if isinstance(innovations, tuple | list) else 0
+        parts = _parts(f"{name}: innovations", innovations, fields_of[: min(max(count, 4), 7)])
+        rows = _array(f"{name}: rows of innovations", parts[0], ("J",))
+        nu = _array(f"{name}: ν of innovations", parts[2], (len(rows), "Z"))
+        rejected, nis, log_likelihood = (
+            None
+            if value is None
+            else _array(f"{name}: {field} of innovations", value, (len(rows),))
+            for field, value in zip(
+                fields_of[4:], (*parts[4:], *[None] * (7 - len(parts))), strict=True
+            )
+        )
+        innovations = Innovations(
+            _whole(rows),
+            _whole(_array(f"{name}: tags of innovations", parts[1], (len(rows),))),
+            nu,
+            _array(f"{name}: S of innovations", parts[3], (len(rows), *[nu.shape[1]] * 2)),
+            np.zeros(len(rows), bool) if rejected is None else rejected > 0,
+            nis,
+            log_likelihood,
+        )
+    return RunEstimate(poses, covs, maps, innovations)
+
+
+def _array(name: str, value: object, shape: tuple[int | str, ...]) -> np.ndarray:
+    """An array of this shape, in which a letter is any number, in float64."""
+    try:
+        array = np.asarray(value, np.float64)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name}: expected real numbers, got {value!r:.60}") from None
+    if array.ndim != len(shape) or any(
+        isinstance(n, int) and n != m for n, m in zip(shape, array.shape, strict=True)
+    ):
+        expected = ", ".join(map(str, shape)) + "," * (len(shape) == 1)
+        raise ValueError(f"{name}: expected shape ({expected}), got {array.shape}")
+    return array
+
+
+def _parts(name: str, value: Any, parts: tuple[str, ...]) -> tuple[Any, ...]:
+    if not isinstance(value, tuple | list) or len(value) != len(parts):
+        raise ValueError(f"{name}: expected ({', '.join(parts)}), got {type(value).__name__}")
+    return tuple(value)
+
+
+def _whole(values: np.ndarray) -> np.ndarray:
+    """Rows or tags as integers; what is none becomes -2, which is refused as a number."""
+    with np.errstate(invalid="ignore"):
+        return np.where(values == np.round(values), values, -2).astype(int)
+
+
+class RunShape(NamedTuple):
+    """The sizes of a run's log."""
+
+    steps: int
+    places: int
+    """M, the largest number of measurements of a step"""
+    size: int
+    """Z, the numbers of a measurement"""
+    landmarks: int
+    every: int
+    """k: steps k, 2k, …, T are judged"""
+
+
+def shape_of(log: Log, truth: Truth, every: int) -> RunShape:
+    """The sizes of a run, from its log and truth."""
+    steps, places, size = np.shape(log.scan.z)
+    return RunShape(steps, places, size, len(truth.landmarks), every)
+
+
+def checked(
+    name: str, estimate: RunEstimate, truth: Truth, shape: RunShape
+) -> tuple[RunEstimate, RunFault | None]:
+    """An estimate with the rows that are judged alone, and what is wrong with the run, if anything.
+
+    Raises ValueError, which begins with a name, on more rows than steps, on a step or a tag that
+    the run does not have, and on a landmark twice in a map.
+    """
+    steps, every = shape.steps, shape.every
+    rows, expected = len(estimate.poses), steps // every
+    if rows == steps and every > 1:
+        at = slice(every - 1, None, every)
+        maps = estimate.maps
+        if maps is not None and maps[2].ndim == 2:
+            maps = tuple(part[at] for part in maps)
+        estimate = estimate._replace(poses=estimate.poses[at], covs=estimate.covs[at], maps=maps)
+    elif rows > expected:
+        counts = f"{steps}" if every == 1 else f"{steps} or {expected}"
+        raise ValueError(f"{name}: poses: expected {counts} rows, got {rows}")
+    if rows < expected:
+        return estimate, RunFault(EARLY, f"{rows} of {expected} rows")
+    _check_identities(name, estimate, shape)
+    for part, values in (
+        ("poses", estimate.poses),
+        ("covs", estimate.covs),
+        ("maps", estimate.maps or ()),
+        ("innovations", estimate.innovations or ()),
+    ):
+        arrays = values if isinstance(values, tuple) else (values,)
+        for array in arrays:
+            if array is not None and not np.isfinite(array).all():
+                row = int(np.argwhere(~np.isfinite(array))[0][0]) if array.ndim else 0
+                return estimate, RunFault(NOT_FINITE, f"{part}, first at row {row}")
+    true_heading = np.asarray(truth.pose, np.float64)[every - 1 :: every, 2]
+    if _is_in_degrees(estimate.poses[:, 2], true_heading):
+        largest = float(np.abs(estimate.poses[:, 2]).max())
+        return estimate, RunFault(DEGREES, f"up to {largest:.4g}, and as degrees it fits the truth")
+    return estimate, None
+
+
+def _is_in_degrees(heading: np.ndarray, true_heading: np.ndarray) -> bool:
+    """Whether headings fit the truth as degrees, and not as radians.
+
+    A heading may be unwrapped: it is beyond ±2π, and fits as radians. As radians, degrees are as
+    good as random, with a root mean square of π/√3 = 1.8; half a radian is no error to be judged.
+    """
+    if np.abs(heading).max() <= TURN:
+        return False
+
+    def misfit(angle: np.ndarray) -> float:
+        error = (angle - true_heading + np.pi) % TURN - np.pi
+        return float(np.sqrt(np.mean(error**2)))
+
+    in_radians = misfit(heading)
+    return in_radians > 0.5 and misfit(np.deg2rad(heading)) < in_radians / 4
+
+
+def _check_identities(name: str, estimate: RunEstimate, shape: RunShape) -> None:
+    """Raise ValueError on a tag or a step that the run does not have."""
+    if estimate.maps is not None:
+        tags = np.atleast_2d(estimate.maps[2])
+        _check_range(f"{name}: maps: tags", tags, -1, shape.landmarks)
+        for row in tags:
+            present = row[row >= 0]
+            if len(np.unique(present)) < len(present):
+                twice = next(int(tag) for tag in present if (present == tag).sum() > 1)
+                raise ValueError(f"{name}: maps: expected each tag once, got {twice} twice")
+    if estimate.innovations is not None:
+        rows, tags, nu, *_ = estimate.innovations
+        _check_range(f"{name}: innovations: rows", rows, 0, shape.steps)
+        _check_range(f"{name}: innovations: tags", tags, -1, shape.landmarks)
+        if len(rows) and nu.shape[1] != shape.size:
+            raise ValueError(
+                f"{name}: innovations: expected ν of {shape.size} numbers, as a measurement has, "
+                f"got {nu.shape[1]}"
+            )
+        most = int(np.bincount(rows).max(initial=0))
+        if most > shape.places:
+            raise ValueError(
+                f"{name}: innovations: expected at most {shape.places} at a step, as many as its "
+                f"measurements, got {most} at step {int(np.bincount(rows).argmax())}"
+            )
+
+
+def _check_range(name: str, values: np.ndarray, least: int, end: int) -> None:
+    outside = values[(values < least) | (values >= end)]
+    if outside.size:
+        raise ValueError(
+            f"{name}: expected whole numbers from {least} to {end - 1}, got {int(outside[0])}"
+        )
+
+
+def trace_of(estimate: RunEstimate | None, shape: RunShape) -> tuple[Estimate, Info]:
+    """The estimate, and the info, of one run at each of its T steps; zero where there is none."""
+    steps, places, size, landmarks, every = shape
+    pose, cov = np.zeros((steps, 3)), np.zeros((steps, 3, 3))
+    points, point_covs = np.zeros((steps, landmarks, 2)), np.zeros((steps, landmarks, 2, 2))
+    alive = np.zeros((steps, landmarks), bool)
+    nis, log_likelihood = np.zeros((steps, places)), np.zeros(steps)
+    status, slot = np.zeros((steps, places), int), np.full((steps, places), -1)
+    nu, S = np.zeros((steps, places, size)), np.zeros((steps, places, size, size))
+    if estimate is not None:
+        judged = np.arange(every - 1, steps, every)
+        pose[judged], cov[judged] = estimate.poses, estimate.covs
+        if estimate.maps is not None:
+            means, map_covs, tags = estimate.maps
+            is_final = tags.ndim == 1
+            for i, step in enumerate(judged[-1:] if is_final else judged):
+                row = tags if is_final else tags[i]
+                at = row[row >= 0]
+                points[step, at] = (means if is_final else means[i])[row >= 0]
+                point_covs[step, at] = (map_covs if is_final else map_covs[i])[row >= 0]
+                alive[step, at] = True
+        if estimate.innovations is not None and len(estimate.innovations.rows):
+            order = np.argsort(estimate.innovations.rows, kind="stable")
+            rows, tags, innovations, covs, rejected, own_nis, terms = (
+                None if part is None else part[order] for part in estimate.innovations
+            )
+            # The place of an innovation is its number among those of its step.
+            place = np.arange(len(rows)) - np.searchsorted(rows, rows)
+            regular = _are_definite(covs)
+            became = np.where(rejected, Status.REJECTED, Status.FUSED)
+            status[rows, place] = np.where(regular, became, Status.SINGULAR)
+            slot[rows, place] = tags
+            nu[rows, place] = innovations
+            S[rows, place] = np.where(regular[:, None, None], covs, np.eye(size))
+            L = np.linalg.cholesky(S[rows, place])
+            white = np.linalg.solve(L, innovations[..., None])[..., 0]
+            squares = (white**2).sum(axis=1) if own_nis is None else own_nis
+            nis[rows, place] = np.where(regular, squares, 0.0)
+            if terms is None:
+                spread = 2 * np.log(np.diagonal(L, axis1=1, axis2=2)).sum(axis=1)
+                terms = -0.5 * (squares + spread + size * np.log(2 * np.pi))
+                terms = np.where(regular & ~rejected, terms, 0.0)
+            np.add.at(log_likelihood, rows, terms)
+    fused = status == Status.FUSED
+    tag = np.where(alive, np.arange(landmarks), -1)
+    info: PyTree = Info(
+        nis=nis,
+        dof=np.where(fused, size, 0),
+        innovation=nu,
+        innovation_cov=S,
+        slot=slot,
+        status=status,
+        log_likelihood=log_likelihood,
+    )
+    return Estimate(pose, cov, points, point_covs, alive, tag), info
+
+
+def _are_definite(covs: Float[np.ndarray, "J Z Z"]) -> np.ndarray:
+    """Whether innovation covariances are symmetric, to a millionth, and positive definite."""
+    size = np.abs(np.diagonal(covs, axis1=1, axis2=2))
+    root = np.sqrt(np.where(size > 0, size, 1.0))
+    scaled = covs / root[:, :, None] / root[:, None, :]
+    symmetric = np.abs(scaled - np.swapaxes(scaled, 1, 2)).max(axis=(1, 2)) <= 1e-6
+    # 100 n eps, as in `block_nees`.
+    least = np.linalg.eigvalsh((scaled + np.swapaxes(scaled, 1, 2)) / 2)[:, 0]
+    return symmetric & (least > 100 * covs.shape[1] * np.finfo(float).eps)
+
+
+def score_estimates(
+    estimates: Sequence[RunEstimate | None],
+    truth: Truth,
+    shape: RunShape,
+    sensor: Sensor,
+    device: jax.Device,
+    block: int,
+) -> Score:
+    """The scores of the estimates of R runs; a run without one is not finite.
+
+    truth: (R, …), float64. block: R or more, for which statistics are compiled once.
+    """
+    runs, every = len(estimates), shape.every
+    # What a measurement is truly of is the identity of a slot by the info of our filters: maps of
+    # such worlds have no landmark of a tag.
+    truth, scores_maps = truth._replace(origin=None), truth.origin is None
+    if not scores_maps:
+        estimates = [e if e is None else e._replace(maps=None) for e in estimates]
+    traces = [trace_of(estimate, shape) for estimate in estimates]
+    estimate, info = jax.tree.map(lambda *leaves: np.stack(leaves), *traces)
+    has_innovations = bool((info.status != Status.EMPTY).any())
+    if has_innovations or estimate.alive.any():
+        statistics = _statistics(estimate, info, truth, sensor, device, block)
+    else:
+        statistics = RunStatistics(
+            finite=np.ones(runs, bool),
+            landmark_nees=np.zeros((runs, shape.steps)),
+            regular_landmarks=np.zeros((runs, shape.steps)),
+            landmark_squares=np.zeros((runs, 2)),
+            autocorrelation=np.zeros((runs, LAGS, 3)),
+            values={},
+        )
+    absent: PyTree = None
+    trace = Trace(
+        Estimate(estimate.pose, estimate.pose_cov, *[absent] * 4),
+        info._replace(innovation=absent, innovation_cov=absent, slot=absent),
+        None,
+        None,
+    )
+    measured = (info.status != Status.EMPTY).sum(axis=(1, 2))
+    truth = truth._replace(missed=np.zeros((runs, shape.steps), int))
+    scores = score(*thinned(trace, truth, statistics, None, measured, every))
+    # The coordinates of its error are not known; without innovations, nor is what it measured.
+    measures = {name: value for name, value in scores.measures.items() if name != "nees_own"}
+    sums = dict(scores.sums)
+    if any(
+        e is not None
+        and e.innovations is not None
+        and e.innovations.nis is not None
+        and e.innovations.log_likelihood is None
+        for e in estimates
+    ):
+        total, _ = measures["log_likelihood"]
+        measures["log_likelihood"] = total, np.zeros(runs)
+    if not has_innovations:
+        del sums["measured"]
+    has_estimate = np.array([estimate is not None for estimate in estimates])
+    return scores._replace(finite=scores.finite & has_estimate, measures=measures, sums=sums)
+
+
+def _statistics(
+    estimate: Estimate, info: Info, truth: Truth, sensor: Sensor, device: jax.Device, block: int
+) -> RunStatistics:
+    """`run_statistics` of each run, by the program of a campaign, padded to a block."""
+    runs = len(estimate.pose)
+    which = np.minimum(np.arange(block), runs - 1)
+    program = statistics_program((device,), ())
+
+    def in_default_dtype(leaf: np.ndarray) -> np.ndarray:
+        # As JAX is set: float32 without 64-bit types.
+        return np.asarray(leaf[which], jnp.result_type(float if leaf.dtype.kind == "f" else leaf))
+
+    by_run, *by_time = jax.tree.map(in_default_dtype, (truth, estimate, info))
+    by_time = jax.tree.map(lambda leaf: np.swapaxes(leaf, 0, 1), by_time)
+    padded = jax.device_get(program(sensor, by_run, *by_time))
+    statistics: RunStatistics = jax.tree.map(lambda leaf: leaf[:runs], padded)
+    return statistics
+
+
+def estimate_of_run(estimate: RunEstimate, shape: RunShape) -> Estimate:
+    """The estimate of one run at the steps that are judged, for figures."""
+    whole, _ = trace_of(estimate, shape)
+    judged = slice(shape.every - 1, None, shape.every)
+    rows: Estimate = jax.tree.map(lambda leaf: leaf[judged], whole)
+    return rows

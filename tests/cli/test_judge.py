@@ -1,0 +1,264 @@
+"""`jaxslam judge`: folders of estimates, programs that write them, and what is refused."""
+
+import json
+import sys
+
+import jax
+import numpy as np
+import pytest
+from command import run_command
+from estimates import write_draws, write_estimates
+
+from jaxslam import catalog, scenarios
+from jaxslam.consistency.campaign import monte_carlo
+
+STEPS, RUNS, KEY = 20, 3, jax.random.key(4)
+ONE = ["--devices", "1", "--figures", "png"]
+
+
+@pytest.fixture(scope="module")
+def world():
+    return scenarios.circle(STEPS)
+
+
+@pytest.fixture(scope="module")
+def ekf(world):
+    return catalog.FILTERS["ekf"](world)
+
+
+@pytest.fixture(scope="module")
+def draws(world, tmp_path_factory):
+    return write_draws(
+        tmp_path_factory.mktemp("draws") / "draws", world, "circle", RUNS, KEY, STEPS
+    )
+
+
+@pytest.fixture
+def estimates(draws, tmp_path):
+    """Estimates of a stranger that is the truth, moved."""
+    return honest(draws, tmp_path / "mine")
+
+
+def honest(draws, folder):
+    for number in range(RUNS):
+        rows = np.loadtxt(draws / f"truth/{number:04d}/truth.csv", delimiter=",", skiprows=1)
+        rows[:, 1:] += 0.1 * np.random.default_rng(number).standard_normal((len(rows), 3))
+        (folder / f"{number:04d}").mkdir(parents=True)
+        write(folder, number, rows)
+    return folder
+
+
+def write(folder, number, rows, cov="0.01,0,0,0.01,0,0.01"):
+    header = "t,x,y,theta,c_xx,c_xy,c_xt,c_yy,c_yt,c_tt\n"
+    text = "".join(",".join(map("{:.17g}".format, row)) + f",{cov}\n" for row in rows)
+    (folder / f"{number:04d}" / "trajectory.csv").write_text(header + text)
+
+
+def read(folder, number):
+    path = folder / f"{number:04d}" / "trajectory.csv"
+    return np.loadtxt(path, delimiter=",", skiprows=1)[:, :4]
+
+
+def judge(*words):
+    return run_command(["judge", *words, *ONE])
+
+
+def result(out):
+    return json.loads((out / "consistency.json").read_text())
+
+
+def test_our_ekf_by_files_has_the_numbers_of_the_campaign(
+    world, ekf, draws, tmp_path, undrawn, capsys
+):
+    folder = write_estimates(tmp_path / "mine", world, ekf, RUNS, KEY)
+    out = tmp_path / "out"
+    assert judge(folder, "--draws", draws, "--filters", "ekf,ideal", "--out", out) == 0
+    stored, printed = result(out), capsys.readouterr().out
+    assert list(stored["filters"]) == ["mine", "ekf", "ideal"]
+    assert (stored["runs"], stored["steps"], stored["scenario"]) == (RUNS, STEPS, "circle")
+    assert stored["command"].startswith("jaxslam judge")
+    mine, ours = stored["filters"]["mine"], stored["filters"]["ekf"]
+    campaign = monte_carlo(world, {"ekf": ekf}, RUNS, KEY, devices=jax.devices()[:1])
+    measures = campaign.filters["ekf"].measures
+    of_steps = {"nees_own", "nees_landmarks"}  # the map in the files is the final one
+    assert mine["measures"].keys() - of_steps == measures.keys() - of_steps
+    for name in measures.keys() - of_steps:
+        for column in (mine, ours):
+            numbers = [column["measures"][name][end] for end in ("value", "low", "high")]
+            expected = [x if np.isfinite(x) else None for x in measures[name]]
+            for number, exact in zip(numbers, expected, strict=True):
+                assert number == exact or abs(number - exact) <= 1e-9 * abs(exact), name
+    assert mine["verdict"] == ours["verdict"] == campaign.filters["ekf"].verdict
+    assert "mine: the landmark NEES is of its final maps" in printed
+    assert {"report.html", "nees.png", "map.png"} <= {path.name for path in out.iterdir()}
+
+
+def test_times_are_matched_and_faults_are_named(draws, estimates, tmp_path, undrawn, capsys):
+    rows = read(estimates, 0)
+    rows[:, 0] += 4e-7  # within half a microsecond
+    start = np.concatenate([[0.0], rows[0, 1:]])  # a line of odometry, which is no step
+    write(estimates, 0, np.concatenate([start[None], rows]))
+    rows = read(estimates, 1)
+    rows[6, 0] += 1e-3
+    write(estimates, 1, rows)
+    (estimates / "0002" / "trajectory.csv").unlink()
+    assert judge(estimates, "--draws", draws, "--out", tmp_path / "out") == 1
+    (stored,) = result(tmp_path / "out")["filters"].values()
+    assert stored["faults"] == {"has times that are not in the truth": [1], "missing": [2]}
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "(run 1: trajectory.csv:8: t = 7.001)" in printed
+    assert "1 missing (run 2: no trajectory.csv in it): averages of the 1 judged runs" in printed
+
+
+@pytest.mark.parametrize(
+    ("kept", "fault"),
+    [(slice(0, 12), "ends early"), (np.r_[0:5, 6:20], "has no estimate at some steps")],
+)
+def test_rows_may_be_absent_where_they_are_not_judged(
+    draws, estimates, tmp_path, undrawn, kept, fault
+):
+    write(estimates, 1, read(estimates, 1)[kept])
+    options = ["--draws", draws, "--out", tmp_path / "out"]
+    judge(estimates, *options)
+    assert result(tmp_path / "out")["filters"]["mine"]["faults"] == {fault: [1]}
+    if fault != "ends early":
+        assert judge(estimates, *options, "--every", "4") == 0
+        assert "faults" not in result(tmp_path / "out")["filters"]["mine"]
+        assert result(tmp_path / "out")["steps"] == 5
+
+
+def test_numbers_that_are_not_finite_are_counted(draws, estimates, tmp_path, undrawn):
+    path = estimates / "0001" / "trajectory.csv"
+    lines = path.read_text().splitlines()
+    lines[3] = lines[3].replace("0.01", "-nan(ind)" if sys.platform == "win32" else "NaN", 1)
+    path.write_text("\n".join(lines) + "\n")
+    assert judge(estimates, "--draws", draws, "--out", tmp_path / "out") == 1
+    assert result(tmp_path / "out")["filters"]["mine"]["faults"] == {"not finite": [1]}
+
+
+PROGRAM = """
+import pathlib, shutil, sys, time
+run, estimate, source = map(pathlib.Path, sys.argv[1:])
+number = int(run.name)
+assert (run / "odometry.csv").exists() and estimate.is_dir() and not list(estimate.iterdir())
+with open(source / "calls", "a") as file:
+    file.write(f"{number}\\n")
+if (source / "fails").exists():
+    if number == 0:
+        print("the matrix is singular", file=sys.stderr)
+        sys.exit(3)
+    if number == 1:
+        (estimate / "trajectory.csv").write_text("half of it")
+        time.sleep(60)
+shutil.copy(source / run.name / "trajectory.csv", estimate)
+"""
+
+
+def test_a_program_is_run_once_a_run_and_again_where_it_failed(
+    draws, estimates, tmp_path, undrawn, capsys, refused
+):
+    script, folder = tmp_path / "filter.py", tmp_path / "theirs"
+    script.write_text(PROGRAM)
+    (estimates / "fails").touch()
+    command = f"{sys.executable} {script} {{run}} {{estimate}} {estimates}"
+    words = [folder, "--draws", draws, "--estimator", command, "--out", tmp_path / "out"]
+    assert judge(*words, "--time-limit", "3") == 1
+    (stored,) = result(tmp_path / "out")["filters"].values()
+    assert stored["faults"] == {"exit status 3": [0], "over the time limit of 3 s": [1]}
+    printed = capsys.readouterr().out
+    assert "theirs, run 0, the first that failed:\nthe matrix is singular" in printed
+    assert {path.name for path in folder.iterdir()} == {"0002"}
+    (estimates / "fails").unlink()
+    (estimates / "calls").unlink()
+    assert judge(*words, "--processes", "1") == 0
+    assert (estimates / "calls").read_text().split() == ["0", "1"]
+    again = result(tmp_path / "out")
+    assert "faults" not in again["filters"]["theirs"] and again["run_seconds"]["theirs"] > 0
+    assert "wall time of a run [s]" in capsys.readouterr().out
+    theirs = f"{sys.executable} {script} {{run}} {{estimate}} elsewhere"
+    refused(
+        ["judge", folder, "--draws", draws, "--estimator", theirs, "--out", tmp_path / "out"],
+        "--estimator: ",
+        "0000 holds an estimate of the command ",
+        "choose another folder of estimates, or remove this one",
+    )
+
+
+def change_line(path, number, text):
+    lines = path.read_text().splitlines()
+    lines[number] = text
+    path.write_text("\n".join(lines) + "\n")
+
+
+NINE = ",".join("0" * 9)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "options", "message"),
+    [
+        (
+            None,
+            ["--draws", "nowhere"],
+            "nowhere: expected a folder of `jaxslam draws`: there is no",
+        ),
+        (None, ["--every", "3"], "--every: expected a divisor of the 20 steps, got 3"),
+        (None, ["--runs", "9"], "--runs: expected at most 3"),
+        (None, ["--filters", "magic"], "--filters: unknown filter 'magic'"),
+        (None, ["--time-limit", "0"], "--time-limit: expected seconds above 0, got 0"),
+        (None, ["--estimator", "prog {run}"], "expected a command with {run} and {estimate}"),
+        (
+            None,
+            ["--estimator", "no-such-1 {run} {estimate}"],
+            "no-such-1: there is no such program",
+        ),
+        (
+            ("trajectory.csv", 4, f"x,{NINE}"),
+            [],
+            "trajectory.csv:5: column 1 (t): expected a number",
+        ),
+        (("trajectory.csv", 4, f"3,{NINE}"), [], "trajectory.csv:5: expected each time once, got"),
+        (("trajectory.csv", 4, "4,0,0"), [], "trajectory.csv:5: expected 10 cells"),
+        (("trajectory.csv", 0, "t,x,y,heading" + ",c" * 6), [], "trajectory.csv:1: "),
+        (("map.csv", 1, "99,0,0,1,0,1"), [], "map.csv:2: column 1 (landmark): expected a landmark"),
+        (("map.csv", 1, "1,0,0,1,0,1\n1,0,0,1,0,1"), [], "map.csv:3: expected a landmark once"),
+        (
+            ("innovations.csv", 0, "t,tag,a,b,c,d"),
+            [],
+            "innovations.csv:1: expected t, tag, 2 columns of",
+        ),
+        (("../0007/trajectory.csv", 0, "t"), [], "has runs 0000 to 0002 alone"),
+    ],
+)
+def test_bad_input_is_one_line(draws, estimates, tmp_path, refused, spoil, options, message):
+    if spoil is not None:
+        name, line, text = spoil
+        path = estimates / "0001" / name
+        path.parent.mkdir(exist_ok=True)
+        if not path.exists():
+            header = "landmark,x,y,c_xx,c_xy,c_yy" if name == "map.csv" else "t"
+            path.write_text(f"{header}\n0,0,0,1,0,1\n")
+        change_line(path.resolve(), line, text)
+    words = ["judge", estimates, "--draws", draws, "--out", tmp_path / "out", *ONE, *options]
+    assert refused(words, message).count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_folders_and_draws_are_asked_for(draws, estimates, tmp_path, refused):
+    refused(
+        ["judge", "--draws", draws, *ONE], "ESTIMATES: expected a folder of estimates, got none"
+    )
+    refused(["judge", estimates, *ONE], "--draws: expected the folder of `jaxslam draws`, got none")
+    refused(
+        ["judge", tmp_path / "none", "--draws", draws, *ONE], "none is no folder: expected 0000/"
+    )
+
+
+def test_draws_of_another_scenario_are_noticed(draws, estimates, tmp_path, refused, world):
+    other = write_draws(
+        tmp_path / "other", world, "circle", 1, jax.random.key(9), STEPS
+    )  # one path
+    (other / "draws.json").write_text((draws / "draws.json").read_text())
+    refused(
+        ["judge", estimates, "--draws", other, "--out", tmp_path / "out", *ONE],
+        "0000/measurements.csv: expected what scenario circle draws here with the key of draws.json",
+    )
