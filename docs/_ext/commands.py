@@ -42,6 +42,7 @@ LIMIT = 900
 """seconds that a block may take"""
 BEGINS = {
     "consistency": "jaxslam._cli.campaigns.consistency:",
+    "draws": "jaxslam._cli.campaigns.draws:",
     "fit": "jaxslam._cli.recorded.fit:",
     "localize": "jaxslam._cli.recorded.localize:",
     "map": "jaxslam._cli.recorded.make_map:",

@@ -14,7 +14,7 @@ import jax
 from threadpoolctl import threadpool_limits
 
 from jaxslam._cli import cache, judge, optimize, verify
-from jaxslam._cli.campaigns import consistency
+from jaxslam._cli.campaigns import consistency, draws
 from jaxslam._cli.common import INTERRUPTED, CompileClock, as_folders, set_device_count
 from jaxslam._cli.environment import environment_text
 from jaxslam._cli.recorded import fit, laser_log, localize, make_map, run, slam
@@ -37,6 +37,13 @@ COMMANDS = {
         "they claim. Prints a table and writes JSON, CSV and figures. The exit status is 1 if a "
         "filter is not finite, or its covariance not valid, in over 5 % of the runs or steps; "
         "verdicts do not change it.",
+    ),
+    "draws": (
+        draws,
+        "write the worlds of a campaign as tables, for an estimator in any language",
+        "Write simulated runs as CSV files, with a README that has the equations of the world: "
+        "what the robot records, and apart from it the truth. An estimator in any language reads "
+        "them.",
     ),
     "judge": (
         judge,

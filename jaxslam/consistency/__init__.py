@@ -2,6 +2,7 @@
 
 from jaxslam._public import publish
 from jaxslam.consistency._bound import conditional_bound, posterior_bound
+from jaxslam.consistency._draws import draws, write_draws
 from jaxslam.consistency._intervals import Average
 from jaxslam.consistency._localization_scores import (
     LocalizationScores,
@@ -38,6 +39,7 @@ __all__ = [
     "conditional_bound",
     "covering_level",
     "credibility",
+    "draws",
     "judge",
     "judge_estimator",
     "judge_localization",
@@ -46,6 +48,7 @@ __all__ = [
     "register",
     "score",
     "summarize_localization",
+    "write_draws",
 ]
 
 publish(__name__)

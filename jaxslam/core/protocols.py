@@ -141,7 +141,14 @@ def _noise_of(owner: str, size: int) -> Check:
 
 
 class Model(Component):
-    """What motion models and sensors share: noise."""
+    """What motion models and sensors share: noise, and equations as text."""
+
+    equations: str = ""
+    """The model as lines of Python, for the README of `consistency.write_draws`; "" where only the
+    docstring describes it. Names are those of entries, as v of "v [m/s]", and of fields. Motion:
+    the pose x, y, theta before and x1, y1, theta1 after, the noise w_v of an entry v. Sensor: its
+    pose x_s, y_s, theta_s in the map, the landmark l_x, l_y, the noise n_range of an entry
+    range. Functions: those of `math`, wrap(a) in (-π, π], sinc(a) = sin(a)/a with sinc(0) = 1."""
 
     def _check_model(self, base: type, methods: tuple[str, ...], named: tuple[str, ...]) -> None:
         """Check a subclass of `base`, and make its noise_cov a record that can be called.

@@ -48,6 +48,17 @@ class Ackermann(Motion):
     """H [m]; negative on the right, 0 where v_e is the centre's speed."""
     controls = ("v_e [m/s]", "steering [rad]", "dt [s]")
     noises = ("v_e [m/s]", "steering [rad]")
+    equations = (
+        "a, b = sensor\n"
+        "curvature = tan(steering + w_steering)/wheelbase\n"
+        "travel = (v_e + w_v_e)/(1 - encoder*curvature)*dt\n"
+        "arc = curvature*travel\n"
+        "ahead = sinc(arc/2)*(travel - arc*b)\n"
+        "left = sinc(arc/2)*arc*a\n"
+        "x1 = x + ahead*cos(theta + arc/2) - left*sin(theta + arc/2)\n"
+        "y1 = y + ahead*sin(theta + arc/2) + left*cos(theta + arc/2)\n"
+        "theta1 = wrap(theta + arc)"
+    )
 
     def _rates(self, u: Control) -> tuple[Array, Array, Array]:
         """Speed v, gain v/v_e and the sensor's twist over v (3,), from curvature κ = tan α/L."""

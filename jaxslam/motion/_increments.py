@@ -22,6 +22,11 @@ class Increment(Motion):
     """(2, 2) covariance of w = (w_d, w_δ), or a function of (pose, u)."""
     controls = ("forward [m]", "turn [rad]")
     noises = ("forward [m]", "turn [rad]")
+    equations = (
+        "x1 = x + (forward + w_forward)*cos(theta)\n"
+        "y1 = y + (forward + w_forward)*sin(theta)\n"
+        "theta1 = wrap(theta + turn + w_turn)"
+    )
 
     def step(self, pose: Pose, u: Control, w: ProcessNoise) -> Pose:
         d, turn = self.perturb(u, w)
@@ -51,6 +56,11 @@ class PoseIncrement(Motion):
     """(3, 3) covariance of w = (w_x, w_y, w_θ), or a function of (pose, u)."""
     controls = ("forward [m]", "left [m]", "turn [rad]")
     noises = ("forward [m]", "left [m]", "turn [rad]")
+    equations = (
+        "x1 = x + (forward + w_forward)*cos(theta) - (left + w_left)*sin(theta)\n"
+        "y1 = y + (forward + w_forward)*sin(theta) + (left + w_left)*cos(theta)\n"
+        "theta1 = wrap(theta + turn + w_turn)"
+    )
 
     def step(self, pose: Pose, u: Control, w: ProcessNoise) -> Pose:
         return se2.compose(pose, self.perturb(u, w))

@@ -34,6 +34,12 @@ class Odometry(Motion):
     """(3, 3) covariance of w = (w1, w2, w3), or a function of (pose, u)."""
     controls = ("rot1 [rad]", "trans [m]", "rot2 [rad]")
     noises = ("rot1 [rad]", "trans [m]", "rot2 [rad]")
+    equations = (
+        "h = theta + rot1 + w_rot1\n"
+        "x1 = x + (trans + w_trans)*cos(h)\n"
+        "y1 = y + (trans + w_trans)*sin(h)\n"
+        "theta1 = wrap(h + rot2 + w_rot2)"
+    )
 
     def step(self, pose: Pose, u: Control, w: ProcessNoise) -> Pose:
         rot1, trans, rot2 = self.perturb(u, w)
@@ -68,6 +74,12 @@ class OdometryNoise:
 
     alpha: ArrayLike = field(check=finite(4, least=0.0))
     """(4,) α1, α3 [1], α2 [rad²/m²], α4 [m²/rad²], not negative"""
+    equations = (
+        "a1, a2, a3, a4 = alpha\n"
+        "variance_of_w_rot1 = a1*rot1**2 + a2*trans**2\n"
+        "variance_of_w_trans = a3*trans**2 + a4*(rot1**2 + rot2**2)\n"
+        "variance_of_w_rot2 = a1*rot2**2 + a2*trans**2"
+    )
 
     def __call__(self, pose: Pose, u: Control) -> ProcessNoiseCov:
         a1, a2, a3, a4 = jnp.asarray(self.alpha, pose.dtype)

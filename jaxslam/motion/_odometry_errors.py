@@ -69,6 +69,26 @@ class Corrected(Motion):
     def noises(self) -> tuple[str, ...]:  # type: ignore[override]
         return self.motion.noises
 
+    @property
+    def equations(self) -> str:  # type: ignore[override]
+        if not self.motion.equations:
+            return ""
+        names = [name.split(" ")[0] for name in self.motion.controls]
+        u, omega = (next(name for name in names if name in of) for of in (_TRAVEL, _TURN))
+        across = [f"{name} = travel*{name}" for name in names if name in _ACROSS]
+        return "\n".join(
+            [
+                "travel, turn_scale = scale",
+                "outer, curvature = wheels",
+                *across,
+                f"{u}, {omega} = "
+                f"travel*{u} - outer*abs({omega}), turn_scale*{omega} + curvature*{u}",
+                "theta = theta + heading",
+                self.motion.equations,
+                "theta1 = wrap(theta1 - heading)",
+            ]
+        )
+
     def step(self, pose: Pose, u: Control, w: ProcessNoise) -> Pose:
         # Into the direction in which the robot drives, and back to its axes.
         moved = self.motion.step(self._turned(pose, 1.0), self.control(u), w)

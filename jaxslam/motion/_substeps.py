@@ -44,6 +44,10 @@ class Substeps(Motion):
         return f"{self.count} x {self.motion.name}"
 
     @property
+    def equations(self) -> str:  # type: ignore[override]
+        return self.motion.equations
+
+    @property
     def controls(self) -> tuple[str, ...]:  # type: ignore[override]
         return _number_names(self.motion.controls, self.count)
 

@@ -26,6 +26,11 @@ class Unicycle(Motion):
     interval, so the displacement's grows with Δt²."""
     controls = ("v [m/s]", "omega [rad/s]", "dt [s]")
     noises = ("v [m/s]", "omega [rad/s]")
+    equations = (
+        "x1 = x + (v + w_v)*dt*cos(theta)\n"
+        "y1 = y + (v + w_v)*dt*sin(theta)\n"
+        "theta1 = wrap(theta + (omega + w_omega)*dt)"
+    )
 
     def step(self, pose: Pose, u: Control, w: ProcessNoise) -> Pose:
         v, omega, dt = self.perturb(u, w)
@@ -61,6 +66,9 @@ class WhiteNoise:
     """[rad/√s] standard deviation of the heading in a second"""
     turn_share: ArrayLike = 0.0
     """[√s] standard deviation of the heading in a second, as a share of ω"""
+    equations = (
+        "variance_of_w_v = travel**2/dt\nvariance_of_w_omega = (turn**2 + (turn_share*omega)**2)/dt"
+    )
 
     def __call__(self, pose: Pose, u: Control) -> ProcessNoiseCov:
         travel, turn, share = (

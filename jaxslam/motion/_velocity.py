@@ -33,6 +33,13 @@ class Velocity(Motion):
     the displacement's grows with Δt²."""
     controls = ("v [m/s]", "omega [rad/s]", "dt [s]")
     noises = ("v [m/s]", "omega [rad/s]", "gamma [rad/s]")
+    equations = (
+        "arc = (omega + w_omega)*dt\n"
+        "chord = (v + w_v)*dt*sinc(arc/2)\n"
+        "x1 = x + chord*cos(theta + arc/2)\n"
+        "y1 = y + chord*sin(theta + arc/2)\n"
+        "theta1 = wrap(theta + arc + w_gamma*dt)"
+    )
     # No `perturb`: the final rotation is not a control, so no u does what w_γ does.
 
     def _twist(self, u: Control, w: ProcessNoise) -> Array:
@@ -67,6 +74,12 @@ class VelocityNoise:
 
     alpha: ArrayLike = field(check=finite(6, least=0.0))
     """(6,) α1, α4, α6 [1], α2 [m²/rad²], α3, α5 [rad²/m²], not negative"""
+    equations = (
+        "a1, a2, a3, a4, a5, a6 = alpha\n"
+        "variance_of_w_v = a1*v**2 + a2*omega**2\n"
+        "variance_of_w_omega = a3*v**2 + a4*omega**2\n"
+        "variance_of_w_gamma = a5*v**2 + a6*omega**2"
+    )
 
     def __call__(self, pose: Pose, u: Control) -> ProcessNoiseCov:
         a1, a2, a3, a4, a5, a6 = jnp.asarray(self.alpha, pose.dtype)

@@ -60,6 +60,7 @@ class Compass(Absolute):
     mount: ArrayLike | None = None
     """(3,) pose of the sensor on the robot; only its angle matters."""
     measurements = ("heading [rad]",)
+    equations = "heading = wrap(theta_s + n_heading)"
     rows = slice(2, 3)
 
 
@@ -78,4 +79,5 @@ class PositionFix(Absolute):
     mount: ArrayLike | None = None
     """(3,) pose of the antenna on the robot; its angle does not matter."""
     measurements = ("x [m]", "y [m]")
+    equations = "x = x_s + n_x\ny = y_s + n_y"
     rows = slice(0, 2)

@@ -88,6 +88,11 @@ class BearingInverseDepth(Sensor):
     """L_d below which landmarks become points; None: never"""
     measurements = ("bearing [rad]",)
     landmark = ("x0 [m]", "y0 [m]", "alpha [rad]", "rho [1/m]")
+    equations = (
+        "l_x = l_x0 + cos(l_alpha)/l_rho\n"
+        "l_y = l_y0 + sin(l_alpha)/l_rho\n"
+        "bearing = wrap(atan2(l_y - y_s, l_x - x_s) - theta_s + n_bearing)"
+    )
 
     @property
     def free(self) -> Free:  # type: ignore[override]

@@ -49,6 +49,10 @@ class Line(Sensor):
     """(3,) pose of the sensor on the robot, Solà's S"""
     measurements = ("distance [m]", "direction [rad]")
     landmark = ("r [m]", "alpha [rad]")
+    equations = (
+        "distance = l_r - x_s*cos(l_alpha) - y_s*sin(l_alpha) + n_distance\n"
+        "direction = wrap(l_alpha - theta_s + n_direction)"
+    )
 
     def observe(self, pose: Pose, landmark: Landmark) -> Measurement:
         frame = self.frame(pose)

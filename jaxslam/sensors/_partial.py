@@ -127,6 +127,7 @@ class BearingOnly(_PolarCoordinate):
     free: FreeLike = field(default=_TEN_METRES, check=prior(1))  # type: ignore[assignment]
     """mean (1,) and covariance (1, 1) of the range [m], Solà (39)"""
     measurements = ("bearing [rad]",)
+    equations = "bearing = wrap(atan2(l_y - y_s, l_x - x_s) - theta_s + n_bearing)"
     _own, _other = slice(1, 2), slice(0, 1)
 
 
@@ -156,4 +157,5 @@ class RangeOnly(_PolarCoordinate):
     free: FreeLike = field(default=_ANY_DIRECTION, check=prior(1))  # type: ignore[assignment]
     """mean (1,) and covariance (1, 1) of the bearing [rad], Solà (39)"""
     measurements = ("range [m]",)
+    equations = "range = sqrt((l_x - x_s)**2 + (l_y - y_s)**2) + n_range"
     _own, _other = slice(0, 1), slice(1, 2)

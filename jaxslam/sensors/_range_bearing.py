@@ -33,6 +33,10 @@ class RangeBearing(Sensor):
     mount: ArrayLike | None = None
     """(3,) pose of the sensor on the robot, Solà's S"""
     measurements = ("range [m]", "bearing [rad]")
+    equations = (
+        "range = sqrt((l_x - x_s)**2 + (l_y - y_s)**2) + n_range\n"
+        "bearing = wrap(atan2(l_y - y_s, l_x - x_s) - theta_s + n_bearing)"
+    )
 
     def observe(self, pose: Pose, landmark: Landmark) -> Measurement:
         return se2.polar_in_frame(self.frame(pose), landmark)
@@ -73,6 +77,11 @@ class RangeBearingNoise:
     """[1] standard deviation of the range, as a share of the range"""
     across: ArrayLike = 0.0
     """[m] standard deviation of the place across the line of sight"""
+    equations = (
+        "# r: the range without noise, in a filter the predicted one; 0/0 is 0\n"
+        "variance_of_n_range = range**2 + (share*r)**2\n"
+        "variance_of_n_bearing = bearing**2 + across**2/(r**2 + across**2)"
+    )
 
     def __call__(self, z: Measurement) -> Array:
         range, bearing, share, across = (

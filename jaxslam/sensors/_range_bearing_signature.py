@@ -36,6 +36,11 @@ class RangeBearingSignature(Sensor):
     """(3,) pose of the sensor on the robot, Solà's S"""
     measurements = ("range [m]", "bearing [rad]", "signature [1]")
     landmark = ("x [m]", "y [m]", "signature [1]")
+    equations = (
+        "range = sqrt((l_x - x_s)**2 + (l_y - y_s)**2) + n_range\n"
+        "bearing = wrap(atan2(l_y - y_s, l_x - x_s) - theta_s + n_bearing)\n"
+        "signature = l_signature + n_signature"
+    )
 
     def observe(self, pose: Pose, landmark: Landmark) -> Measurement:
         seen = se2.polar(se2.to_frame(self.frame(pose), landmark[:2]))

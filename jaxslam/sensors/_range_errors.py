@@ -38,6 +38,23 @@ class Corrected(Wrapped):
             raise InvalidField(type(self).__name__, "sensor", reason)
         super().__post_init__()
 
+    @property
+    def equations(self) -> str:  # type: ignore[override]
+        unchanged = [
+            line for line in self.sensor.equations.splitlines() if not line.startswith("range = ")
+        ]
+        lines = [
+            "scale, offset = range",
+            "r = sqrt((l_x - x_s)**2 + (l_y - y_s)**2)",
+            "range = scale*r + offset + n_range",
+        ]
+        if self.axis is not None:
+            lines[2:] = [
+                "phi = atan2(l_y - y_s, l_x - x_s) - theta_s",
+                "range = scale*r*cos(phi - axis) + offset + n_range",
+            ]
+        return "\n".join(lines + unchanged) if self.sensor.equations else ""
+
     def observe(self, pose: Pose, landmark: Landmark) -> Measurement:
         z = self.sensor.observe(pose, landmark)
         scale, offset = self._line(z)

@@ -31,6 +31,10 @@ class RelativePosition(Sensor):
     mount: ArrayLike | None = None
     """(3,) pose of the sensor on the robot, Solà's S"""
     measurements = ("ahead [m]", "left [m]")
+    equations = (
+        "ahead = (l_x - x_s)*cos(theta_s) + (l_y - y_s)*sin(theta_s) + n_ahead\n"
+        "left = (l_y - y_s)*cos(theta_s) - (l_x - x_s)*sin(theta_s) + n_left"
+    )
 
     def observe(self, pose: Pose, landmark: Landmark) -> Measurement:
         return se2.to_frame(self.frame(pose), landmark)

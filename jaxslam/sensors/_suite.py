@@ -29,6 +29,10 @@ class Wrapped(Sensor):
         return self.sensor.name
 
     @property
+    def equations(self) -> str:  # type: ignore[override]
+        return self.sensor.equations
+
+    @property
     def measurements(self) -> tuple[str, ...]:  # type: ignore[override]
         return self.sensor.measurements
 

@@ -1,7 +1,8 @@
 """The world generator: `simulate` draws a truth and the log a robot records, from a scenario and a
 key."""
 
-from collections.abc import Mapping
+import functools
+from collections.abc import Callable, Mapping
 from dataclasses import field
 from functools import partial
 from typing import Any, Literal
@@ -19,6 +20,7 @@ from jaxslam.core._record import FrozenDict, hold_function, record, set_field, s
 from jaxslam.core._validation import check_record, reworded_tracer_errors
 from jaxslam.core.protocols import Component, Motion, Sensor
 from jaxslam.core.types import Log, Scan, Truth
+from jaxslam.math._xla import quick_options
 from jaxslam.math.angles import wrap
 from jaxslam.sensors._suite import Suite
 from jaxslam.simulation._scans import (
@@ -259,6 +261,30 @@ def world_of_run(scenario: World, key: Array, number: int) -> tuple[Truth, Log]:
 @jax.jit
 def _draw_run(scenario: World, key: Array, number: int) -> tuple[Truth, Log]:
     return scenario.run(key, number)
+
+
+BLOCK = 16
+"""Number of runs of a campaign that a CPU draws together. The same number of a run has the same
+bits at the same place in a block of the same size."""
+
+
+def draw_block(scenario: World, key: Array, first: int) -> tuple[Truth, Log]:
+    """The truths and logs (BLOCK, …) of the runs first, first + 1, … of a campaign, in NumPy.
+
+    Compiled as the campaign compiles its draws, so that they have the bits of a campaign's on a
+    CPU, if first is a multiple of BLOCK.
+    """
+    numbers = np.arange(first, first + BLOCK, dtype=jnp.result_type(int))
+    program = _draws_program(jax.default_backend())
+    with jax.transfer_guard("allow"), reworded_tracer_errors(f"{scenario.name}: draw"):
+        histories: tuple[Truth, Log] = jax.device_get(program(scenario, key, numbers))
+        return histories
+
+
+@functools.cache
+def _draws_program(platform: str) -> Callable[..., tuple[Truth, Log]]:
+    draw = jax.vmap(lambda scenario, key, number: scenario.run(key, number), (None, None, 0))
+    return jax.jit(draw, compiler_options=quick_options(platform))
 
 
 def run_keys(key: Array, number: int | Array) -> Array:

@@ -10,6 +10,7 @@ import pytest
 from recordings import write
 
 from jaxslam import datasets
+from jaxslam.association import Nearest
 from jaxslam.core.types import Estimate
 from jaxslam.datasets import evaluate
 from jaxslam.math.numpy_poses import compose
@@ -65,6 +66,35 @@ def test_a_table_by_hand_with_every_setting(tmp_path):
     np.testing.assert_allclose(data.pose_cov, np.diag([0.01, 0.04, 0.09]))
     assert data.one_frame
     assert data.assumed == ()
+
+
+def test_gates_births_a_share_of_the_range_and_a_start_that_is_correlated(tmp_path):
+    settings = """
+[sensor]
+noise = [0, 0.02]
+share = 0.1
+[filter]
+associate = "nearest"
+gate = 0.9
+new_gate = 0.95
+births = 2
+start_covariance = [[0.04, 0.01, 0], [0.01, 0.04, 0], [0, 0, 0.09]]
+"""
+    data = datasets.table(write(tmp_path, OWN | {"dataset.toml": settings}))
+    cov = data.sensor.noise_cov(np.array([2.0, 0.3]))
+    np.testing.assert_allclose(cov, np.diag([0.2, 0.02]) ** 2, rtol=1e-12)
+    np.testing.assert_array_equal(data.pose_cov, [[0.04, 0.01, 0], [0.01, 0.04, 0], [0, 0, 0.09]])
+    rule = data.filter_options.pop("associate")
+    assert (type(rule), rule.gate, rule.new_gate) == (Nearest, 0.9, 0.95)
+    assert data.filter_options == {"correction": "sequential", "births": 2}
+    for old, new, reason in (
+        ("new_gate = 0.95", "new_gate = 0.8", "new_gate: expected new_gate >= gate = 0.9, got 0.8"),
+        ("births = 2", "start_noise = [0, 0, 0]", "start_covariance: expected no start_noise"),
+        ("[[0.04, 0.01, 0]", "[[0.04, 0.02, 0]", "start_covariance: expected a covariance"),
+    ):
+        changed = {"dataset.toml": settings.replace(old, new)}
+        with pytest.raises(ValueError, match=reason):
+            datasets.table(write(tmp_path, OWN | changed))
 
 
 def test_defaults_are_listed(tmp_path):
@@ -290,6 +320,11 @@ def test_a_file_that_is_missing_or_no_text_is_named(tmp_path, name):
         ("[filter]\ncapacity = 1", "[filter] capacity: expected a whole number of at least 2"),
         ("[filter]\nstart = [0, 0]", "[filter] start: expected 3 numbers (x [m], y [m], theta [rad])"),
         ("[filter]\nstart_noise = [0, 0, -1]", "[filter] start_noise: expected numbers of at least"),
+        ("[filter]\nstart_covariance = [1, 2, 3]", "[filter] start_covariance: expected 3 numbers"),
+        ("[filter]\nstart_covariance = 3", "[filter] start_covariance: expected 3 rows of numbers"),
+        ("[filter]\nbirths = 0", "[filter] births: expected a whole number of at least 1, got 0"),
+        ("[filter]\nnew_gate = 0.99", "[filter] new_gate: expected none of known tags, got 0.99"),
+        ("[sensor]\nshare = -1", "[sensor] share: expected a number >= 0, of a sensor of range [m]"),
         ("[filter]\nassociate = 'best'", "[filter] associate: expected one of nearest, global_near"),
         ("[filter]\nupdate = 'batch'", '[filter] update: expected "sequential" or "joint"'),
         ("[robot]\nmass = 1", ":1: robot: expected one of name, source, motion, sensor, filter"),

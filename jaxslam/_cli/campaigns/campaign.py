@@ -19,6 +19,7 @@ from jaxslam.results import store
 from jaxslam.results._block_files import MANIFEST, is_unfinished, read_manifest
 from jaxslam.results._campaign_files import BLOCKS, RESULT
 from jaxslam.results._files import Json
+from jaxslam.simulation.scenarios import SCENARIOS
 
 
 class CampaignOptions(NamedTuple):
@@ -31,6 +32,35 @@ class CampaignOptions(NamedTuple):
     seed: int = 0
     bound: bool = False
     dtype: str = "float64"
+
+
+def add_world_options(group: argparse._ArgumentGroup) -> None:
+    """Add the options of the worlds of a campaign, with the defaults of `CampaignOptions`."""
+    scenarios = f"one of: {', '.join(SCENARIOS)}; or FILE.py:NAME, a Scenario or a function that "
+    add_campaign_option(group, "scenario", scenarios + "returns one")
+    add_campaign_option(group, "runs", "number of simulated trajectories")
+    add_campaign_option(
+        group, "steps", "number of steps of each trajectory; default: the scenario's own"
+    )
+    add_campaign_option(group, "seed", "seed of the random numbers")
+
+
+def add_campaign_option(group: argparse._ArgumentGroup, name: str, text: str) -> None:
+    """Add an option of a campaign, a word or a number; it is absent from the options if left out,
+    so that those of a folder take its place."""
+    default = getattr(CampaignOptions(), name)
+    kind = str if isinstance(default, str) else int
+    text += "" if default is None else f" (default: {default})"
+    group.add_argument(f"--{name}", type=kind, default=argparse.SUPPRESS, help=text)
+
+
+def check_world_options(options: CampaignOptions) -> None:
+    """Raise ValueError on numbers of steps or runs below 1, and on a seed out of range."""
+    for name, count in (("steps", options.steps), ("runs", options.runs)):
+        if count is not None:
+            check_count(f"--{name}", count)
+    if not 0 <= options.seed < 2**32:
+        raise ValueError(f"--seed: expected an integer from 0 to 2³²-1, got {options.seed}")
 
 
 @dataclass(frozen=True)
@@ -60,11 +90,9 @@ def spec_of(options: argparse.Namespace) -> Spec:
     campaign, settings, block = _campaign(options)
     out = options.resume or options.out or OUT
     formats = campaign_files.check_figure_formats("--figures", options.figures.split(","))
-    for name, count in (("steps", campaign.steps), ("runs", campaign.runs), ("block", block)):
-        if count is not None:
-            check_count(f"--{name}", count)
-    if not 0 <= campaign.seed < 2**32:
-        raise ValueError(f"--seed: expected an integer from 0 to 2³²-1, got {campaign.seed}")
+    check_world_options(campaign)
+    if block is not None:
+        check_count("--block", block)
     part = None
     if options.part is not None:
         match = re.fullmatch(r"(\d+)/(\d+)", options.part, re.ASCII)

@@ -13,8 +13,9 @@ import jax
 
 from jaxslam._cli import cache
 from jaxslam._cli.campaigns.campaign import (
-    CampaignOptions,
     Spec,
+    add_campaign_option,
+    add_world_options,
     earlier_results,
     open_store,
     spec_of,
@@ -40,7 +41,6 @@ from jaxslam.results import _campaign_files as campaign_files
 from jaxslam.results._campaign_files import FORMATS
 from jaxslam.results._files import Files, Json
 from jaxslam.simulation._worlds import World, world_of_run
-from jaxslam.simulation.scenarios import SCENARIOS
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -48,19 +48,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     campaign = parser.add_argument_group(
         "campaign", "kept in the folder of results; --resume reads them there"
     )
-    for name, text in {
-        "scenario": f"one of: {', '.join(SCENARIOS)}; or FILE.py:NAME, a Scenario or a function "
-        "that returns one",
-        "filters": f'"all", or some of: {", ".join(ALL)}; and FILE.py:NAME, a Filter or a function '
-        "of the scenario that returns one; comma-separated",
-        "runs": "number of simulated trajectories",
-        "steps": "number of steps of each trajectory; default: the scenario's own",
-        "seed": "seed of the random numbers",
-    }.items():
-        default = getattr(CampaignOptions(), name)
-        kind = str if isinstance(default, str) else int
-        text += "" if default is None else f" (default: {default})"
-        campaign.add_argument(f"--{name}", type=kind, default=argparse.SUPPRESS, help=text)
+    add_world_options(campaign)
+    add_campaign_option(
+        campaign,
+        "filters",
+        f'"all", or some of: {", ".join(ALL)}; and FILE.py:NAME, a Filter or a function of the '
+        "scenario that returns one; comma-separated",
+    )
     campaign.add_argument(
         "--bound",
         action=argparse.BooleanOptionalAction,

@@ -41,7 +41,7 @@ from jaxslam.core.protocols import Candidate, Filter, Sensor
 from jaxslam.core.types import Estimate, Info, Log, Trace, Truth
 from jaxslam.filters._ekf.monitor import Monitor
 from jaxslam.math._xla import hot_options, quick_options
-from jaxslam.simulation._worlds import World, run_keys
+from jaxslam.simulation._worlds import BLOCK, World, run_keys
 
 Draws = tuple[Truth, Log]
 
@@ -212,7 +212,7 @@ def fitting_block(scenario: World, filters: Mapping[str, Candidate], device: jax
     4096 at most, and 1024 where the device does not tell its memory.
     """
     if device.platform == "cpu":
-        return 16
+        return BLOCK
     memory = (device.memory_stats() or {}).get("bytes_limit")
     if memory is None:
         return 1024

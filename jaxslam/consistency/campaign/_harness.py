@@ -18,6 +18,7 @@ import numpy as np
 from jax.typing import DTypeLike
 
 from jaxslam._origin import far_origin, may_move, moved, returned
+from jaxslam.consistency._digests import identity
 from jaxslam.consistency._summary import Summary, summarize
 from jaxslam.consistency._tally import Tally
 from jaxslam.consistency.campaign._block import BOUND, CampaignPlan
@@ -29,7 +30,6 @@ from jaxslam.consistency.campaign._candidates import (
     method_of,
     without_noise,
 )
-from jaxslam.consistency.campaign._digests import identity
 from jaxslam.consistency.campaign._kept import Keep, add_kept
 from jaxslam.consistency.campaign._pieces import check_part, cores, in_part, missing_pieces
 from jaxslam.consistency.campaign._precision import precision_doubts

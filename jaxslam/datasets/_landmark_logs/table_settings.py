@@ -101,24 +101,33 @@ METHODS: dict[str, Callable[..., Associate]] = {
 }
 
 
-def association_options(method: object, gate: Any) -> dict[str, Any]:
-    """Options of `EkfSlam` for a method by name and a gate.
+def association_options(method: object, gate: Any, new_gate: Any = None) -> dict[str, Any]:
+    """Options of `EkfSlam` for a method by name and its gates.
 
-    Raises InvalidField, of associate or gate, on an unknown name and a gate that is not a
-    probability. By default known identities have no gate, other methods `GATE`.
+    Raises InvalidField, of associate, gate or new_gate, on an unknown name, a gate that is not a
+    probability, and a new_gate of known identities or below the gate. By default known identities
+    have no gate, other methods `GATE`.
 
     Args:
         method: one of `METHODS`.
         gate: the probability that a correct measurement passes.
+        new_gate: the probability of the gate of new landmarks; by default `NEW_GATE`, or the gate
+            if that is larger.
     """
     check_gate("filter", gate)
     if not isinstance(method, str) or method not in METHODS:
         reason = f"expected one of {', '.join(METHODS)}, got {method!r}"
         raise InvalidField("filter", "associate", reason)
     if method == "known":
+        if new_gate is not None:
+            raise InvalidField("filter", "new_gate", f"expected none of known tags, got {new_gate}")
         return {} if gate is None else {"gate": gate}
     probability = GATE if gate is None else gate
-    return {"associate": METHODS[method](probability, max(probability, NEW_GATE))}
+    beyond = max(probability, NEW_GATE) if new_gate is None else new_gate
+    try:
+        return {"associate": METHODS[method](probability, beyond)}
+    except InvalidField as problem:
+        raise InvalidField("filter", "new_gate", problem.reason) from problem
 
 
 FITTED = "fit.toml"
@@ -171,7 +180,10 @@ _MEASUREMENT_NOISE = {"m": 0.1, "rad": 0.05, "1": 1.0}
 ROOM = 100
 """Default number of landmarks, where identities are unknown."""
 RANGE_BEARING = ("range [m]", "bearing [rad]")
-_FILTER = ("gate", "capacity", "associate", "update", "start", "start_noise", "spacing")
+_FILTER = (
+    *("gate", "new_gate", "capacity", "associate", "update", "births"),
+    *("start", "start_noise", "start_covariance", "spacing"),
+)
 _ODOMETRY_ERRORS = {
     "scale": (("travel", "turn"), (1.0, 1.0)),
     "wheels": (("outer [m]", "curvature [rad/m]"), (0.0, 0.0)),
@@ -319,10 +331,10 @@ class TableSettings:
 
     def sensor(self, header: Sequence[str]) -> Parametric[Sensor]:
         """The sensor. header: the columns of the measurements."""
-        further = (*_RANGE_ERRORS, "across", "delay", "max_range")
+        further = (*_RANGE_ERRORS, "across", "share", "delay", "max_range")
         factory, options = self._model("sensor", sensors.REGISTRY, header, further)
         errors = {key: options.pop(key) for key in _RANGE_ERRORS if key in options}
-        across = options.pop("across", None)
+        across, share = options.pop("across", None), options.pop("share", None)
         for key in ("delay", "max_range"):  # settings of the log, not arguments of the model
             options.pop(key, None)
         mount, has_mount = None, "mount" in inspect.signature(factory).parameters
@@ -331,10 +343,13 @@ class TableSettings:
         bare = self._build("sensor", factory, options, of_no_noise)
         names = bare.measurements
         parameters = self._noise("sensor", names, _MEASUREMENT_NOISE)
-        if not all(parameter.value for parameter in parameters):
+        share = 0.0 if share is None else self._of_range_bearing("share", share, "[1]", names)
+        # A share of the range is noise enough of a range.
+        if not all(p.value for p in parameters if not (share and p.name == "sensor range [m]")):
             raise ValueError(f"{self._at('sensor', 'noise')}: expected numbers above 0")
         if across is not None:
-            parameters += (self._across(across, names),)
+            spread = self._of_range_bearing("across", across, "[m]", names)
+            parameters += (Parameter("sensor across [m]", spread, "noise", ("sensor", "across")),)
         before_mount = len(parameters)
         if has_mount:
             if mount is None:
@@ -354,8 +369,9 @@ class TableSettings:
         def uncorrected(p: JaxOrNumPy) -> Sensor:
             # NumPy for plain numbers, so that nothing is compiled.
             noise: NoiseCov = p[: len(names), None] ** 2 * np.eye(len(names))
-            if across is not None:
-                noise = sensors.RangeBearingNoise(p[0], p[1], across=p[2])
+            if across is not None or share:
+                wide = 0.0 if across is None else p[2]
+                noise = sensors.RangeBearingNoise(p[0], p[1], share, wide)
             place = {"mount": p[before_mount : before_mount + 3]} if has_mount else {}
             return self._build("sensor", factory, options | place, noise)
 
@@ -371,15 +387,17 @@ class TableSettings:
         values = np.array([parameter.value for parameter in parameters])
         return Parametric(parameters, corrected, (corrected if errors else uncorrected)(values))
 
-    def _across(self, across: object, measurements: tuple[str, ...]) -> Parameter:
-        """The standard deviation across the line of sight, which range and bearing share."""
-        (spread,) = self._numbers("sensor", "across", across, ("[m]",))
-        if measurements != RANGE_BEARING or spread < 0:
+    def _of_range_bearing(
+        self, key: str, value: object, unit: str, measurements: tuple[str, ...]
+    ) -> float:
+        """The number of a key that only a sensor of range and bearing has."""
+        (number,) = self._numbers("sensor", key, value, (unit,))
+        if measurements != RANGE_BEARING or number < 0:
             raise ValueError(
-                f"{self._at('sensor', 'across')}: expected a number >= 0, of a sensor of "
-                f"{' and '.join(RANGE_BEARING)}, got {spread:g} of {', '.join(measurements)}"
+                f"{self._at('sensor', key)}: expected a number >= 0, of a sensor of "
+                f"{' and '.join(RANGE_BEARING)}, got {number:g} of {', '.join(measurements)}"
             )
-        return Parameter("sensor across [m]", spread, "noise", ("sensor", "across"))
+        return number
 
     def delay(self) -> float:
         """The time by which measurements are stamped later than they happened [s]."""
@@ -429,11 +447,18 @@ class TableSettings:
                 f'{self._at("filter", "update")}: expected "sequential" or "joint", got {update!r}'
             )
         options: dict[str, Any] = {"correction": update}
+        if (births := section.get("births")) is not None:
+            if type(births) is not int or births < 1:  # a bool is an int, too
+                raise ValueError(
+                    f"{self._at('filter', 'births')}: expected a whole number of at least 1, got "
+                    f"{births!r}"
+                )
+            options["births"] = births
         method, gate = section.get("associate"), section.get("gate")
         if method is None:
             method = self._default("filter", "associate", "nearest" if unknown else "known")
         try:
-            options |= association_options(method, gate)
+            options |= association_options(method, gate, section.get("new_gate"))
         except InvalidField as problem:
             raise ValueError(f"{self._at('filter', problem.field)}: {problem.reason}") from problem
         if gate is None:
@@ -456,14 +481,25 @@ class TableSettings:
         """The pose (3,) before the first row; None if the file has none."""
         return self._pose("start")
 
-    def start_noise(self) -> np.ndarray:
-        """The standard deviations (3,) of the pose at the start."""
-        deviations = self._pose("start_noise")
+    def start_cov(self) -> np.ndarray:
+        """The covariance (3, 3) of the pose at the start."""
+        deviations, matrix = self._pose("start_noise"), self._filter().get("start_covariance")
+        if matrix is not None:
+            place = self._at("filter", "start_covariance")
+            if deviations is not None:
+                raise ValueError(f"{place}: expected no start_noise beside it")
+            if not isinstance(matrix, list) or len(matrix) != 3:
+                raise ValueError(f"{place}: expected 3 rows of numbers ({', '.join(POSE)})")
+            rows = [self._numbers("filter", "start_covariance", row, POSE) for row in matrix]
+            cov = np.array(rows)
+            if asymmetric(cov) or indefinite(cov):
+                raise ValueError(f"{place}: expected a covariance")
+            return cov
         if deviations is None:
-            return np.array(self._default("filter", "start_noise", [0.0, 0.0, 0.0]))
+            deviations = np.array(self._default("filter", "start_noise", [0.0, 0.0, 0.0]))
         if (deviations < 0).any():
             raise ValueError(f"{self._at('filter', 'start_noise')}: expected numbers of at least 0")
-        return deviations
+        return np.diag(deviations) ** 2
 
     def _filter(self) -> dict[str, object]:
         section: dict[str, object] = self.content.get("filter", {})
@@ -583,7 +619,7 @@ class TableSettings:
             )
         numbers = [float(number) for number in value]
         for name, number in zip(names, numbers, strict=True):
-            if "[rad]" in name and abs(number) > TURN and key != "covariance":
+            if "[rad]" in name and abs(number) > TURN and "covariance" not in key:
                 self.assumed.append(
                     f"[{section}] {key}: {name} = {number:g} is beyond 2π: degrees? write radians"
                 )

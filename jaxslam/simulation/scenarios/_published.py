@@ -2,8 +2,6 @@
 
 import dataclasses
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxslam.core._numbers import check_count
@@ -11,7 +9,7 @@ from jaxslam.core.protocols import Sensor
 from jaxslam.math.stats import sigma_gate
 from jaxslam.motion._increments import Increment
 from jaxslam.motion._unicycle import Unicycle
-from jaxslam.sensors._range_bearing import RangeBearing
+from jaxslam.sensors._range_bearing import RangeBearing, RangeBearingNoise
 from jaxslam.sensors._relative_position import RelativePosition
 from jaxslam.simulation._scans import BetweenRanges
 from jaxslam.simulation._worlds import Scenario
@@ -144,11 +142,8 @@ def loop(steps: int = 2500, map_seed: int = 0) -> Scenario:
 
 def loop_bearing(steps: int = 2500, map_seed: int = 0) -> Scenario:
     """`loop` with ranges and bearings, σ_r = 10 % of the range, σ_φ = 10°."""
-    return _loop("loop_bearing", RangeBearing(_loop_noise_cov), steps, map_seed)
-
-
-def _loop_noise_cov(z: jax.Array) -> jax.Array:
-    return jnp.diag(jnp.stack([0.1 * z[0], jnp.full_like(z[0], np.deg2rad(10.0))]) ** 2)
+    noise = RangeBearingNoise(range=0.0, bearing=np.deg2rad(10.0), share=0.1)
+    return _loop("loop_bearing", RangeBearing(noise), steps, map_seed)
 
 
 def loop_landmarks(map_seed: int) -> np.ndarray:

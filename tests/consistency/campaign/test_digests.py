@@ -12,7 +12,7 @@ import pytest
 import worlds
 
 from jaxslam import filters, sensors, store
-from jaxslam.consistency.campaign import _digests as digests
+from jaxslam.consistency import _digests as digests
 from jaxslam.consistency.campaign import monte_carlo
 from jaxslam.core.record import record
 
