@@ -1,14 +1,16 @@
-"""EKF-SLAM with filterpy's ExtendedKalmanFilter, for the draws of a robot with velocities and a sensor of
-relative positions at its pose, as those of the worlds `circle` and `loop`:
+"""EKF-SLAM with filterpy's ExtendedKalmanFilter, for the draws of a robot with velocities and a
+sensor of relative positions at its pose, as those of the worlds `circle` and `loop`:
 
     pip install filterpy
     python filterpy_ekf.py draws/runs/0000 estimates/0000
 
-The state x is the robot's pose (x, y, theta), then (x, y) of each landmark in the order in which they are
-first measured. filterpy has a state of one size; here x, P and the identity of its update grow.
+The state x is the robot's pose (x, y, theta), then (x, y) of each landmark in the order in which
+they are first measured. filterpy has a state of one size; here x, P and the identity of its update
+grow.
 """
 
 import csv
+import itertools
 import sys
 import tomllib
 from pathlib import Path
@@ -98,7 +100,7 @@ def main(run, estimate):
         np.array(settings["filter"]["start"]), *(np.diag(sigma) ** 2 for sigma in deviations)
     )
     trajectory, innovations = [], []
-    for before, now in zip(odometry, odometry[1:]):
+    for before, now in itertools.pairwise(odometry):
         t = now[0]
         slam.predict(np.array([before[1], before[2], t - before[0]]))
         scan = measured[measured[:, 0] == t, 1:]

@@ -1,17 +1,19 @@
-"""ISAM2 and the batch optimum of GTSAM, for the draws of a robot with velocities and a sensor of relative
-positions at its pose, as those of the worlds `circle` and `loop`:
+"""ISAM2 and the batch optimum of GTSAM, for the draws of a robot with velocities and a sensor of
+relative positions at its pose, as those of the worlds `circle` and `loop`:
 
     pip install gtsam
     python gtsam_slam.py draws/runs/0000 isam2/0000
     python gtsam_slam.py --batch draws/runs/0000 batch/0000
 
-ISAM2 gives each pose with its covariance as soon as the scan there is used, as a filter does. The batch
-gives them after the last scan: the smoothed path. The factors are those of both, and exactly the model of
-the draws: the sensor measures R'(l - p), and the robot does not move sideways, which is a constraint.
+ISAM2 gives each pose with its covariance as soon as the scan there is used, as a filter does. The
+batch gives them after the last scan: the smoothed path. Both have the same factors, exactly the
+model of the draws: the sensor measures R'(l - p), and the robot does not move sideways, which is a
+constraint.
 """
 
 import argparse
 import csv
+import itertools
 import math
 import tomllib
 from pathlib import Path
@@ -80,8 +82,8 @@ def main(run, estimate, batch, threshold):
     sigma_v, sigma_omega = settings["motion"]["noise"]
     sigmas = gtsam.noiseModel.Diagonal.Sigmas  # a σ of 0 is a constraint
     sensor_noise = sigmas(np.array(settings["sensor"]["noise"]))
-    # A start that is known exactly is known to a micrometre here: GTSAM's marginals of a pose that is
-    # known in one direction are zero in all of them.
+    # Of a pose that is known exactly in one direction GTSAM's marginal covariance is zero in all:
+    # a start that is known exactly is known to a micrometre here.
     start_noise = sigmas(np.maximum(settings["filter"]["start_noise"], 1e-6))
 
     parameters = gtsam.ISAM2Params()  # relinearizes every 10 updates what moved by more than 0.1
@@ -94,7 +96,7 @@ def main(run, estimate, batch, threshold):
     factors, values = [gtsam.PriorFactorPose2(X(0), pose, start_noise)], gtsam.Values()
     values.insert(X(0), pose)
     trajectory, tags = [], set()
-    for k, (before, now) in enumerate(zip(odometry, odometry[1:])):
+    for k, (before, now) in enumerate(itertools.pairwise(odometry)):
         t, dt = now[0], now[0] - before[0]
         travel, turn = before[1] * dt, before[2] * dt
         motion_noise = sigmas(np.array([sigma_v * dt, 0, sigma_omega * dt]))
