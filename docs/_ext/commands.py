@@ -44,6 +44,7 @@ BEGINS = {
     "consistency": "jaxslam._cli.campaigns.consistency:",
     "draws": "jaxslam._cli.campaigns.draws:",
     "fit": "jaxslam._cli.recorded.fit:",
+    "judge": "jaxslam._cli.judge:",
     "localize": "jaxslam._cli.recorded.localize:",
     "map": "jaxslam._cli.recorded.make_map:",
     "optimize": "jaxslam._cli.optimize:",

@@ -143,7 +143,7 @@ def _judge_estimates(options: argparse.Namespace, command: str) -> int:
             runs,
             draws.key,
             filters=filters,
-            every=options.every,
+            stride=options.every,
             bound=options.bound,
             devices=devices,
         )
@@ -182,8 +182,8 @@ def _check_folder(folder: Path, draws: DrawsFolder, may_be_empty: bool) -> None:
             f"{run_name(draws.runs - 1)} alone"
         )
     if not content & names and not may_be_empty:
-        what = "holds no estimate" if folder.is_dir() else "is no folder"
+        problem = "holds no estimate" if folder.is_dir() else "is no folder"
         raise ValueError(
-            f"{folder} {what}: expected {run_name(0)}/trajectory.csv, and so on, for each run of "
-            f"{draws.path}"
+            f"{folder} {problem}: expected {run_name(0)}/trajectory.csv, and so on, for each run "
+            f"of {draws.path}"
         )

@@ -133,7 +133,7 @@ def folder_source(
     estimates: Path,
     draws: DrawsFolder,
     measurements: Sequence[str],
-    every: int,
+    stride: int,
     failures: Mapping[int, RunFault],
 ) -> Source:
     """The estimates in a folder, read run by run, as `judge_sources` takes them.
@@ -158,7 +158,7 @@ def folder_source(
             return Outcome(truth, None, failures[number])
         folder = estimates / name
         size = int(np.shape(log.scan.z)[2])
-        result = read_estimate(folder, in_file, every, size)
+        result = read_estimate(folder, in_file, stride, size)
         if isinstance(result, RunFault):
             return Outcome(truth, None, result)
         return Outcome(truth, result, None, _seconds(folder / PROGRAM))
@@ -199,14 +199,16 @@ def _seconds(path: Path) -> float | None:
         return None
 
 
-def read_estimate(folder: Path, truth: TruthOfRun, every: int, size: int) -> RunEstimate | RunFault:
-    """The estimate in a folder, at steps k, 2k, …, T, or why there is none; k is `every`.
+def read_estimate(
+    folder: Path, truth: TruthOfRun, stride: int, size: int
+) -> RunEstimate | RunFault:
+    """The estimate in a folder, at steps k, 2k, …, T, or why there is none; k is `stride`.
 
     size: Z, of a measurement. Raises ValueError, with file and line, on what is not such a file.
     """
     if stored_file(folder / TRAJECTORY) is None:
-        what = f"no {TRAJECTORY} in it" if folder.is_dir() else f"no folder {folder.name}"
-        return RunFault(MISSING, what)
+        detail = f"no {TRAJECTORY} in it" if folder.is_dir() else f"no folder {folder.name}"
+        return RunFault(MISSING, detail)
     steps = len(truth.pose)
     path = _Table(folder / TRAJECTORY)
     at = path.steps(truth)
@@ -217,7 +219,7 @@ def read_estimate(folder: Path, truth: TruthOfRun, every: int, size: int) -> Run
         if step >= 0 and row_of.setdefault(step, row) != row:
             line = path.lines[row_of[step]]
             raise path.error(row, f"expected each time once, got that of line {line} again")
-    judged = range(every - 1, steps, every)
+    judged = range(stride - 1, steps, stride)
     present = [step for step in judged if step in row_of]
     if len(present) < len(judged):
         if present == list(judged[: len(present)]):

@@ -69,6 +69,29 @@ def test_a_plan_of_python_runs_as_the_command_does(tmp_path, undrawn):
     assert same == {key: summary[key] for key in same}
 
 
+def test_innovations_are_written_on_demand(tmp_path, undrawn):
+    data, out = write_bonn(tmp_path / "bonn"), tmp_path / "out"
+    run = ["run", "--dataset", "bonn", str(data), "--innovations", "--out", str(out)]
+    assert cli.main(run) == 0
+    with (out / "innovations.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    summary = json.loads((out / "summary.json").read_text())
+    assert len(rows) == summary["status"]["fused"] + summary["status"]["rejected"] == 4
+    assert [row["tag"] for row in rows] == ["1", "2"] * 2
+    upper = [name for name in rows[0] if name.startswith("s_")]
+    squares = []
+    for row in rows:
+        nu = np.array([float(row[name]) for name in rows[0] if name.startswith("nu_")])
+        a, b, c = (float(row[name]) for name in upper)
+        squares.append(nu @ np.linalg.solve([[a, b], [b, c]], nu))
+    nis = [float(row["nis"]) for row in rows]
+    np.testing.assert_allclose(np.mean(nis) / 2, summary["NIS / dof"], rtol=1e-9)
+    # Of the first of each scan: the others are given those before them, or after their correction.
+    np.testing.assert_allclose(nis[::2], squares[::2], rtol=1e-9)
+    likely = sum(float(row["log_likelihood"]) for row in rows)
+    np.testing.assert_allclose(likely, summary["log-likelihood"], rtol=1e-9)
+
+
 def test_run_writes_films_and_says_what_is_missing(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(FFMpegWriter, "isAvailable", lambda: False)
     scenes, film = [], plot.Film

@@ -38,6 +38,7 @@ GIVEN = {
     "docs/methods/association.md": {"500"},  # draws
     "docs/methods/bearings_and_ranges.md": {"2.5", "0.5"},  # standard deviations of range
     "docs/methods/graphs.md": {"100", "434", "3,300"},  # steps, sizes of graphs, a bound of χ²
+    "docs/methods/information_filters.md": {"300"},  # steps
     "docs/methods/laser/grid_localization.md": {"5,000"},  # particles
     "docs/methods/laser/grids.md": {"2.37"},  # the honest median of a NEES
     "docs/methods/laser/laser_slam.md": {"910", "406", "340", "292"},  # scans of the logs

@@ -80,9 +80,9 @@ class Programs:
         except (OSError, ValueError, LookupError, TypeError):
             command = None
         if command != self._command:
-            what = "no command" if command is None else f"the command {command!r}"
+            origin = "no command" if command is None else f"the command {command!r}"
             raise ValueError(
-                f"--estimator: {folder} holds an estimate of {what}: choose another folder of "
+                f"--estimator: {folder} holds an estimate of {origin}: choose another folder of "
                 "estimates, or remove this one"
             )
         return True

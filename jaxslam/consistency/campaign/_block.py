@@ -55,7 +55,7 @@ class CampaignPlan:
     """compute the conditional Cramér-Rao bound of every run"""
     dtype: np.dtype | None = None
     """dtype of the worlds; None for JAX's default"""
-    every: int = 1
+    stride: int = 1
     """k: steps k, 2k, …, T are judged; a divisor of T"""
 
     @property
@@ -194,7 +194,7 @@ class BlockRunner:
         measured = valid.reshape(len(valid), -1).sum(axis=1)
         scores: dict[str, dict[str, np.ndarray]] = {}
         run_0, seconds = {}, {}
-        judged = slice(plan.every - 1, None, plan.every)
+        judged = slice(plan.stride - 1, None, plan.stride)
         for name, candidate in self._filters.items():
             began = time.perf_counter()
             results: FilterResults = jax.block_until_ready(
@@ -210,43 +210,43 @@ class BlockRunner:
                 self._statistics(self._world.sensor, draws[0], results.estimate, results.info)
             )
             chart_error = np.swapaxes(jax.device_get(results.chart_error), 0, 1)
-            by_run = _on_host(results), truth, statistics, chart_error, measured
-            score_of_runs = score(
-                *thinned(*jax.tree.map(lambda leaf: leaf[wanted], by_run), plan.every)
-            )
+            by_run: PyTree = _on_host(results), truth, statistics, chart_error, measured
+            by_run = jax.tree.map(lambda leaf: leaf[wanted], by_run)
+            score_of_runs = score(*thinned(plan.stride, *by_run))
             scores[name] = condense(score_of_runs, first, float(self._limit))
         scores[BOUND] = {"limit": self._limit}
         if plan.bound:
             variances = jax.device_get(bound(self._world, self._key, numbers, *draws))
             scores[BOUND] |= condensed_sums(
-                {n: rows[wanted, plan.every - 1 :: plan.every] for n, rows in variances.items()}
+                {n: rows[wanted, plan.stride - 1 :: plan.stride] for n, rows in variances.items()}
             )
         return BlockResult(scores, run_0, seconds, self.compile_seconds)
 
 
 def thinned(
+    stride: int,
     trace: Trace,
     truth: Truth,
     statistics: RunStatistics,
     chart_error: np.ndarray | None,
     measured: np.ndarray,
-    every: int,
 ) -> tuple[Trace, Truth, RunStatistics, np.ndarray | None, np.ndarray]:
-    """The arguments of `score` at steps k, 2k, …, T of R runs; k is `every`.
+    """The arguments of `score` at steps k, 2k, …, T of R runs; k is `stride`.
 
     Measurements are none of a step alone: those of k steps are put side by side.
     """
-    if every == 1:
+    if stride == 1:
         return trace, truth, statistics, chart_error, measured
-    at = np.s_[:, every - 1 :: every]
+    at = np.s_[:, stride - 1 :: stride]
 
     def of_windows(leaf: np.ndarray) -> np.ndarray:
         # (R, T, M) -> (R, T/k, k M)
-        return leaf.reshape(len(leaf), leaf.shape[1] // every, -1)
+        return leaf.reshape(len(leaf), leaf.shape[1] // stride, -1)
 
     estimate, info = trace.estimate, trace.info
-    by_window = {name: of_windows(getattr(info, name)) for name in ("nis", "dof", "status")}
-    log_likelihood = of_windows(np.asarray(info.log_likelihood)).sum(axis=2, dtype=np.float64)
+    by_window: PyTree = {name: of_windows(getattr(info, name)) for name in ("nis", "dof", "status")}
+    likelihood = of_windows(np.asarray(info.log_likelihood))
+    by_window["log_likelihood"] = likelihood.sum(axis=2, dtype=np.float64)
     values = {
         name: value[at] if isinstance(value, np.ndarray) and value.ndim == 2 else value
         for name, value in statistics.values.items()
@@ -254,7 +254,7 @@ def thinned(
     return (
         trace._replace(
             estimate=estimate._replace(pose=estimate.pose[at], pose_cov=estimate.pose_cov[at]),
-            info=info._replace(log_likelihood=log_likelihood, **by_window),
+            info=info._replace(**by_window),
             probe=None if trace.probe is None else trace.probe[at],
         ),
         truth._replace(pose=truth.pose[at]),

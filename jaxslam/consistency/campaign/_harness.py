@@ -265,7 +265,7 @@ def summed_up(
         scenario=scenario.name,
         source=scenario.source,
         published={name: dict(values) for name, values in scenario.published.items()},
-        steps=scenario.steps // plan.every,
+        steps=scenario.steps // plan.stride,
         runs=finished,
         dtype=str(limit.dtype),
         divergence_limit=float(limit),

@@ -69,7 +69,7 @@ def judge_estimator(
     *,
     filters: Mapping[str, Candidate] = MappingProxyType({}),
     name: str = "estimator",
-    every: int = 1,
+    stride: int = 1,
     bound: bool = False,
     block: int | None = None,
     devices: Sequence[jax.Device] | None = None,
@@ -101,14 +101,14 @@ def judge_estimator(
         key: a PRNG key.
         filters: of the library, on the same draws, by name; as in `monte_carlo`.
         name: of the estimator in tables and figures.
-        every: k: steps k, 2k, …, T are judged alone, also of `filters`; a divisor of the steps T.
+        stride: k: steps k, 2k, …, T are judged alone, also of `filters`; a divisor of the steps T.
             The function may return these rows alone.
         bound, block, devices, progress: as in `monte_carlo`.
     Returns:
         Campaign.
     Raises:
-        ValueError: on arguments that `monte_carlo` does not take, a name that a filter has, `every`
-            that does not divide the steps, and a result of the function of another form or shape.
+        ValueError: on arguments that `monte_carlo` does not take, a name that a filter has, a
+            stride that does not divide the steps, and a result of another form or shape.
     """
     if not callable(function) or isinstance(function, type):
         raise InvalidField(
@@ -136,7 +136,7 @@ def judge_estimator(
         runs,
         key,
         filters=filters,
-        every=every,
+        stride=stride,
         bound=bound,
         block=block,
         devices=devices,
@@ -151,7 +151,7 @@ def judge_sources(
     key: jax.Array,
     *,
     filters: Mapping[str, Candidate],
-    every: int = 1,
+    stride: int = 1,
     bound: bool = False,
     block: int | None = None,
     devices: Sequence[jax.Device] | None = None,
@@ -159,12 +159,12 @@ def judge_sources(
 ) -> Campaign:
     """The campaign of estimators from elsewhere, by name, and of filters; see `judge_estimator`."""
     with jax.transfer_guard("allow"):
-        _check(world, sources, runs, key, filters, every, block)
+        _check(world, sources, runs, key, filters, stride, block)
         began, runs = time.perf_counter(), int(runs)
         devices = jax.local_devices() if devices is None else list(devices)
         size = int(block or (fitting_block(world, filters, devices[0]) if filters else 16))
         near, near_filters, origin = near_the_origin(world, filters)
-        plan = CampaignPlan(near, near_filters, key, devices, size, bound, None, every)
+        plan = CampaignPlan(near, near_filters, key, devices, size, bound, None, stride)
         pieces = missing_pieces([], runs, plan.wide)
         judged = _judge_pieces(plan, sources, pieces, origin, progress)
         # The filters, and with them the limit of accuracy, which needs the world alone.
@@ -182,9 +182,9 @@ def judge_sources(
             for name, summary in campaign.filters.items()
         }
         notes = [note for name, estimator in judged.items() for note in estimator.notes(name)]
-        if every > 1:
+        if stride > 1:
             notes.insert(
-                0, f"judged at {campaign.steps:,} of {world.steps:,} steps: each {every}th."
+                0, f"judged at {campaign.steps:,} of {world.steps:,} steps, one in {stride}."
             )
         return replace(
             campaign,
@@ -280,7 +280,7 @@ def _judge_pieces(
             for i in range(count):
                 truth, log = jax.tree.map(lambda leaf, i=i: leaf[i], (truths, logs))
                 truth = truth if origin is None else returned(truth, origin)
-                shape = shape_of(log, truth, plan.every)
+                shape = shape_of(log, truth, plan.stride)
                 for name, source in sources.items():
                     copied = jax.tree.map(np.copy, log)  # the estimator may write into it
                     outcome = source(first + i, truth, copied)
@@ -298,7 +298,7 @@ def _judge_pieces(
                         judged[name].first = (
                             rows_of_truth(
                                 with_positions(world.sensor, outcome.truth),
-                                slice(plan.every - 1, None, plan.every),
+                                slice(plan.stride - 1, None, plan.stride),
                             ),
                             estimate_of_run(outcome.estimate, shape),
                         )
@@ -333,20 +333,20 @@ def _check(
     runs: int,
     key: jax.Array,
     filters: Mapping[str, Candidate],
-    every: int,
+    stride: int,
     block: int | None,
 ) -> None:
     """Raise ValueError on arguments that `judge_estimator` does not take."""
     check_record("judge_estimator", "world", world, World)
-    for name, value in (("runs", runs), ("every", every), ("block", block)):
+    for name, value in (("runs", runs), ("stride", stride), ("block", block)):
         if value is not None:
             check_count(f"judge_estimator: {name}", value)
     if (most := world.recorded_runs) is not None and runs > most:
         reason = f"expected at most {most}, the recorded runs of {world.name}, got {runs}"
         raise InvalidField("judge_estimator", "runs", reason)
-    if world.steps % every:
-        reason = f"expected a divisor of the {world.steps} steps, got {every}"
-        raise InvalidField("judge_estimator", "every", reason)
+    if world.steps % stride:
+        reason = f"expected a divisor of the {world.steps} steps, got {stride}"
+        raise InvalidField("judge_estimator", "stride", reason)
     check_key("judge_estimator", key)
     if not is_concrete(key):
         raise ValueError("judge_estimator: call it outside of jax.jit")

@@ -53,7 +53,7 @@ class Innovations(NamedTuple):
 class RunEstimate(NamedTuple):
     """An estimate of one run of T steps by a program of your own: NumPy arrays, in map coordinates.
 
-    It has a row at each of the K = T steps, or at each k-th (`every`). Leave out what your
+    It has a row at each of the K = T steps, or at each k-th (`stride`). Leave out what your
     estimator does not have: what is made of it has no row in the table.
     """
 
@@ -166,14 +166,14 @@ class RunShape(NamedTuple):
     size: int
     """Z, the numbers of a measurement"""
     landmarks: int
-    every: int
+    stride: int
     """k: steps k, 2k, …, T are judged"""
 
 
-def shape_of(log: Log, truth: Truth, every: int) -> RunShape:
+def shape_of(log: Log, truth: Truth, stride: int) -> RunShape:
     """The sizes of a run, from its log and truth."""
     steps, places, size = np.shape(log.scan.z)
-    return RunShape(steps, places, size, len(truth.landmarks), every)
+    return RunShape(steps, places, size, len(truth.landmarks), stride)
 
 
 def checked(
@@ -184,16 +184,16 @@ def checked(
     Raises ValueError, which begins with a name, on more rows than steps, on a step or a tag that
     the run does not have, and on a landmark twice in a map.
     """
-    steps, every = shape.steps, shape.every
-    rows, expected = len(estimate.poses), steps // every
-    if rows == steps and every > 1:
-        at = slice(every - 1, None, every)
+    steps, stride = shape.steps, shape.stride
+    rows, expected = len(estimate.poses), steps // stride
+    if rows == steps and stride > 1:
+        at = slice(stride - 1, None, stride)
         maps = estimate.maps
         if maps is not None and maps[2].ndim == 2:
             maps = tuple(part[at] for part in maps)
         estimate = estimate._replace(poses=estimate.poses[at], covs=estimate.covs[at], maps=maps)
     elif rows > expected:
-        counts = f"{steps}" if every == 1 else f"{steps} or {expected}"
+        counts = f"{steps}" if stride == 1 else f"{steps} or {expected}"
         raise ValueError(f"{name}: poses: expected {counts} rows, got {rows}")
     if rows < expected:
         return estimate, RunFault(EARLY, f"{rows} of {expected} rows")
@@ -209,7 +209,7 @@ def checked(
             if array is not None and not np.isfinite(array).all():
                 row = int(np.argwhere(~np.isfinite(array))[0][0]) if array.ndim else 0
                 return estimate, RunFault(NOT_FINITE, f"{part}, first at row {row}")
-    true_heading = np.asarray(truth.pose, np.float64)[every - 1 :: every, 2]
+    true_heading = np.asarray(truth.pose, np.float64)[stride - 1 :: stride, 2]
     if _is_in_degrees(estimate.poses[:, 2], true_heading):
         largest = float(np.abs(estimate.poses[:, 2]).max())
         return estimate, RunFault(DEGREES, f"up to {largest:.4g}, and as degrees it fits the truth")
@@ -270,7 +270,7 @@ def _check_range(name: str, values: np.ndarray, least: int, end: int) -> None:
 
 def trace_of(estimate: RunEstimate | None, shape: RunShape) -> tuple[Estimate, Info]:
     """The estimate, and the info, of one run at each of its T steps; zero where there is none."""
-    steps, places, size, landmarks, every = shape
+    steps, places, size, landmarks, stride = shape
     pose, cov = np.zeros((steps, 3)), np.zeros((steps, 3, 3))
     points, point_covs = np.zeros((steps, landmarks, 2)), np.zeros((steps, landmarks, 2, 2))
     alive = np.zeros((steps, landmarks), bool)
@@ -278,7 +278,7 @@ def trace_of(estimate: RunEstimate | None, shape: RunShape) -> tuple[Estimate, I
     status, slot = np.zeros((steps, places), int), np.full((steps, places), -1)
     nu, S = np.zeros((steps, places, size)), np.zeros((steps, places, size, size))
     if estimate is not None:
-        judged = np.arange(every - 1, steps, every)
+        judged = np.arange(stride - 1, steps, stride)
         pose[judged], cov[judged] = estimate.poses, estimate.covs
         if estimate.maps is not None:
             means, map_covs, tags = estimate.maps
@@ -291,9 +291,8 @@ def trace_of(estimate: RunEstimate | None, shape: RunShape) -> tuple[Estimate, I
                 alive[step, at] = True
         if estimate.innovations is not None and len(estimate.innovations.rows):
             order = np.argsort(estimate.innovations.rows, kind="stable")
-            rows, tags, innovations, covs, rejected, own_nis, terms = (
-                None if part is None else part[order] for part in estimate.innovations
-            )
+            ordered: PyTree = [p if p is None else p[order] for p in estimate.innovations]
+            rows, tags, innovations, covs, rejected, own_nis, terms = ordered
             # The place of an innovation is its number among those of its step.
             place = np.arange(len(rows)) - np.searchsorted(rows, rows)
             regular = _are_definite(covs)
@@ -313,16 +312,9 @@ def trace_of(estimate: RunEstimate | None, shape: RunShape) -> tuple[Estimate, I
             np.add.at(log_likelihood, rows, terms)
     fused = status == Status.FUSED
     tag = np.where(alive, np.arange(landmarks), -1)
-    info: PyTree = Info(
-        nis=nis,
-        dof=np.where(fused, size, 0),
-        innovation=nu,
-        innovation_cov=S,
-        slot=slot,
-        status=status,
-        log_likelihood=log_likelihood,
-    )
-    return Estimate(pose, cov, points, point_covs, alive, tag), info
+    # In the order of `Info`, whose fields are declared as JAX arrays.
+    numbers: PyTree = nis, np.where(fused, size, 0), nu, S, slot, status, log_likelihood
+    return Estimate(pose, cov, points, point_covs, alive, tag), Info(*numbers)
 
 
 def _are_definite(covs: Float[np.ndarray, "J Z Z"]) -> np.ndarray:
@@ -333,7 +325,7 @@ def _are_definite(covs: Float[np.ndarray, "J Z Z"]) -> np.ndarray:
     symmetric = np.abs(scaled - np.swapaxes(scaled, 1, 2)).max(axis=(1, 2)) <= 1e-6
     # 100 n eps, as in `block_nees`.
     least = np.linalg.eigvalsh((scaled + np.swapaxes(scaled, 1, 2)) / 2)[:, 0]
-    return symmetric & (least > 100 * covs.shape[1] * np.finfo(float).eps)
+    return np.asarray(symmetric & (least > 100 * covs.shape[1] * np.finfo(float).eps))
 
 
 def score_estimates(
@@ -348,7 +340,7 @@ def score_estimates(
 
     truth: (R, …), float64. block: R or more, for which statistics are compiled once.
     """
-    runs, every = len(estimates), shape.every
+    runs, stride = len(estimates), shape.stride
     # What a measurement is truly of is the identity of a slot by the info of our filters: maps of
     # such worlds have no landmark of a tag.
     truth, scores_maps = truth._replace(origin=None), truth.origin is None
@@ -360,14 +352,10 @@ def score_estimates(
     if has_innovations or estimate.alive.any():
         statistics = _statistics(estimate, info, truth, sensor, device, block)
     else:
-        statistics = RunStatistics(
-            finite=np.ones(runs, bool),
-            landmark_nees=np.zeros((runs, shape.steps)),
-            regular_landmarks=np.zeros((runs, shape.steps)),
-            landmark_squares=np.zeros((runs, 2)),
-            autocorrelation=np.zeros((runs, LAGS, 3)),
-            values={},
-        )
+        by_step = np.zeros((runs, shape.steps))
+        # In the order of `RunStatistics`, whose fields are declared as JAX arrays.
+        on_runs: PyTree = np.ones(runs, bool), by_step, by_step, np.zeros((runs, 2))
+        statistics = RunStatistics._make((*on_runs, np.zeros((runs, LAGS, 3)), {}))
     absent: PyTree = None
     trace = Trace(
         Estimate(estimate.pose, estimate.pose_cov, *[absent] * 4),
@@ -377,7 +365,7 @@ def score_estimates(
     )
     measured = (info.status != Status.EMPTY).sum(axis=(1, 2))
     truth = truth._replace(missed=np.zeros((runs, shape.steps), int))
-    scores = score(*thinned(trace, truth, statistics, None, measured, every))
+    scores = score(*thinned(stride, trace, truth, statistics, None, measured))
     # The coordinates of its error are not known; without innovations, nor is what it measured.
     measures = {name: value for name, value in scores.measures.items() if name != "nees_own"}
     sums = dict(scores.sums)
@@ -417,7 +405,7 @@ def _statistics(
 
 def estimate_of_run(estimate: RunEstimate, shape: RunShape) -> Estimate:
     """The estimate of one run at the steps that are judged, for figures."""
-    whole, _ = trace_of(estimate, shape)
-    judged = slice(shape.every - 1, None, shape.every)
-    rows: Estimate = jax.tree.map(lambda leaf: leaf[judged], whole)
+    of_steps, _ = trace_of(estimate, shape)
+    judged = slice(shape.stride - 1, None, shape.stride)
+    rows: Estimate = jax.tree.map(lambda leaf: leaf[judged], of_steps)
     return rows

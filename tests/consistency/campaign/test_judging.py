@@ -198,7 +198,7 @@ def test_fewer_rows_are_judged_where_they_are_and_so_are_filters():
             maps=tuple(part[4::5] for part in estimate.maps),
         )
 
-    options = {"filters": {"ekf": ekf}, "every": 5, **ONE}
+    options = {"filters": {"ekf": ekf}, "stride": 5, **ONE}
     few = judge_estimator(world, seldom, RUNS, KEY, **options)
     full = judge_estimator(world, stranger, RUNS, KEY, **options)
     whole = monte_carlo(world, {"ekf": ekf}, RUNS, KEY, **ONE).filters["ekf"]
@@ -226,7 +226,7 @@ def test_a_final_map_alone_has_an_error_and_a_nees_of_the_last_step(ring):
     every_step = judge_estimator(ring, stranger, RUNS, KEY, **ONE)
     a, b = (c.filters["estimator"].measures for c in (with_final, every_step))
     np.testing.assert_allclose(a["rmse_landmarks"], b["rmse_landmarks"], rtol=1e-9)
-    last = judge_estimator(ring, stranger, RUNS, KEY, every=10, **ONE).filters["estimator"]
+    last = judge_estimator(ring, stranger, RUNS, KEY, stride=10, **ONE).filters["estimator"]
     np.testing.assert_allclose(a["nees_landmarks"], last.measures["nees_landmarks"], rtol=1e-9)
     assert "nis_per_dof" not in a
     assert "the landmark NEES is of its final maps" in with_final.notes[0]
@@ -302,7 +302,7 @@ NU = [0], [0], [[0.0, 0.0]], [np.eye(2)]
         {},
         "innovations: expected ν of 2 numbers, as a measurement has, got 1",
     ),
-    (len, {"every": 3}, "judge_estimator: every: expected a divisor of the 10 steps, got 3"),
+    (len, {"stride": 3}, "judge_estimator: stride: expected a divisor of the 10 steps, got 3"),
     (len, {"name": " "}, "judge_estimator: name: expected a name, as 'mine', got ' '"),
     (len, {"name": "ekf", "filters": {"ekf": 0}}, "name: 'ekf' is the name of a filter"),
     (len, {"filters": ["ekf"]}, "judge_estimator: filters: expected {name: filter}, got a list"),
