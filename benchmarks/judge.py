@@ -69,7 +69,7 @@ def judged(world, runs: int, folder: Path, programs: dict[str, list[str]], proce
         command = f"{shlex.join(words)} {{run}} {{estimate}}"
         estimates = folder / name
         faults = Programs(command, draws.path, estimates, None).run(range(runs), processes)
-        sources[name] = folder_source(estimates, draws, 1, faults)
+        sources[name] = folder_source(estimates, draws, world.sensor.measurements, 1, faults)
     filters = {name: FILTERS[name](world) for name in OURS}
     return judge_sources(world, sources, runs, draws.key, filters=filters)
 
