@@ -118,13 +118,13 @@ def main(run, estimate, batch, threshold):
         factors, values = [], gtsam.Values()
     optimum, marginals = isam.calculateBestEstimate(), isam
     if batch:
-        # Not optimize(): the error rises when a step repairs the constraints that the step before it
-        # has left by their curvature, and optimize() takes any rise for convergence.
+        # Not optimize(): the error may rise when a step repairs what the last one has broken of
+        # the constraints, which are curved, and optimize() takes any rise for convergence.
         optimizer = gtsam.GaussNewtonOptimizer(graph, optimum, gtsam.GaussNewtonParams())
         for _ in range(30):
             optimizer.iterate()
-            step = optimum.localCoordinates(optimizer.values()).norm()
-            optimum = optimizer.values()
+            before, optimum = optimum, gtsam.Values(optimizer.values())  # iterate() frees its own
+            step = before.localCoordinates(optimum).norm()
             if step < 1e-8:
                 break
         else:
