@@ -56,6 +56,7 @@ BENCHMARKS = {
     "graph_speed": "graphs.speed",
     "graph_crossover": "graphs.crossover",
     "alternatives": "alternatives",
+    "judge": "judge",
     "fastslam": "fastslam",
     "plain_particles": "plain_particles",
     "grids": "grids.benchmark",
