@@ -231,9 +231,9 @@ def _estimates(world: World) -> str:
         "triangle of the covariance of (x, y, theta) in the axes of the map |"
         f"{landmarks}\n| `estimates/0000/innovations.csv` (optional) | `t,tag,{nu},{s}` | a line a "
         "measurement of a landmark that the map has: its innovation nu (measured minus predicted, "
-        "angles wrapped), and the upper triangle of its covariance S; optional columns: rejected, 1 "
-        "where a gate dropped it; nis and log_likelihood, where a scan is used as a whole and these "
-        "are not of nu and S alone |\n\n"
+        "angles wrapped), and the upper triangle of its covariance S; optional columns: rejected, "
+        "1 where a gate dropped it; nis and log_likelihood, where a scan is used as a whole and "
+        "these are not of nu and S alone |\n\n"
         "Write 17 digits, and a row for every scan, also for an empty one: a row that is missing, "
         "not finite, or whose covariance is not positive definite is counted. With `--every 10` "
         "the judge expects every tenth row alone. "
@@ -247,7 +247,8 @@ def _judging() -> str:
         "covariances (NEES, intervals, a verdict), beside filters of the package on the same runs, "
         "and can run your program itself:\n\n```console\n"
         "$ jaxslam judge estimates --draws draws --filters ekf --out out\n"
-        "$ jaxslam judge estimates --draws draws --estimator './my_filter {run} {estimate}' --out out\n```"
+        "$ jaxslam judge estimates --draws draws --out out --estimator './my_filter {run} "
+        "{estimate}'\n```"
     )
 
 
