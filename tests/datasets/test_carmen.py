@@ -118,7 +118,7 @@ def test_a_file_without_scans_and_a_range_below_zero_are_refused(tmp_path):
     empty = written(tmp_path / "empty.log", "FLASER 0 0 0 0 0 0 0 1 host 1")
     with pytest.raises(ValueError, match=r"empty\.log:1: expected scans with beams, got 1 of 0"):
         datasets.carmen(empty)
-    with pytest.raises(ValueError, match="max_range above 0"):
+    with pytest.raises(ValueError, match="max_range: expected a number above 0"):
         datasets.carmen(path, max_range=0.0)
 
 

@@ -90,7 +90,7 @@ start_covariance = [[0.04, 0.01, 0], [0.01, 0.04, 0], [0, 0, 0.09]]
     assert (type(rule), rule.gate, rule.new_gate) == (Nearest, 0.9, 0.95)
     assert data.filter_options == {"correction": "sequential", "births": 2}
     for old, new, reason in (
-        ("new_gate = 0.95", "new_gate = 0.8", "new_gate: expected new_gate >= gate = 0.9, got 0.8"),
+        ("new_gate = 0.95", "new_gate = 0.8", "new_gate: expected at least gate = 0.9, got 0.8"),
         ("births = 2", "start_noise = [0, 0, 0]", "start_covariance: expected no start_noise"),
         ("[[0.04, 0.01, 0]", "[[0.04, 0.02, 0]", "start_covariance: expected a covariance"),
     ):
@@ -457,7 +457,7 @@ def test_a_true_path_with_a_hole_is_no_world_and_no_control(tmp_path):
     (tmp_path / "truth.csv").write_text("".join(text[:101] + text[250:]))
     data = datasets.table(tmp_path)
     places = np.zeros((data.capacity, 2))
-    with pytest.raises(ValueError, match=r"^recorded_world: true pose of run 0, row 100: expected .* cut the log"):  # fmt: skip
+    with pytest.raises(ValueError, match=r"^recorded_world: poses: expected .* of run 0, row 100: cut the log"):  # fmt: skip
         jaxslam.recorded_world(data.motion, data.sensor, [data.log], [data.true_path], places)
     mapping = jaxslam.filters.Mapping(data.sensor, data.capacity)
     log = data.log._replace(control=data.true_path)

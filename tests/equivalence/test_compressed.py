@@ -145,7 +145,10 @@ def test_gradients_pass_through_a_change_of_area():
         {"area": 4, "sensor": sensors.Compass(np.eye(1))},
         "the sensor compass, which has no landmarks",
     ),
-    ({"area": PLACES - 1}, f"area >= {PLACES}, the measurement slots of a scan, got {PLACES - 1}"),
+    (
+        {"area": PLACES - 1},
+        f"area: expected at least {PLACES}, as a scan has slots, got {PLACES - 1}",
+    ),
 )
 def test_refusals(options):
     world, logs = tour()

@@ -96,7 +96,9 @@ def test_a_pose_that_nothing_reaches_is_named(name):
     graph = small_graphs.only(small_graphs.drawn(), "relative_pose")
     table = graph.tables["relative_pose"]
     cut = table._replace(valid=(table.who != 4).all(axis=1))
-    with pytest.raises(ValueError, match=f"{name}: pose 14 is not connected to a fixed pose"):
+    with pytest.raises(
+        ValueError, match=f"{name}: graph: pose 14 is not connected to a fixed pose"
+    ):
         starts.STARTS[name](graph._replace(tables={"relative_pose": cut}))
 
 

@@ -92,18 +92,21 @@ def unlike(**fields):
 
 
 @refused(
-    ({"logs": []}, "logs as a list of Log, one a run, got an empty list"),
-    ({"logs": Log(np.zeros((2, 3)), Scan(*[np.zeros((2, 1))] * 3))}, "logs as a list"),
+    ({"logs": []}, "logs: expected a list of Log, one a run, got an empty list"),
+    (
+        {"logs": Log(np.zeros((2, 3)), Scan(*[np.zeros((2, 1))] * 3))},
+        "logs: expected a list of Log",
+    ),
     ({"logs": [None]}, r"logs\[0\]: expected a Log, got None"),
     ({"logs": ragged()}, r"got \(6, 2\) in run 0 and \(5, 2\) in run 4"),
-    ({"logs": unlike(z=np.full((6, 2, 2), np.nan))}, "run 1: .* is not finite"),
+    ({"logs": unlike(z=np.full((6, 2, 2), np.nan))}, "logs\\[1\\].*: .* is not finite"),
     ({"logs": unlike(tag=np.tile([0, 2], (6, 1)))}, r"below 2, .* got 2 \(run 1, row 0\)"),
     ({"poses": np.zeros((5, 4, 3))}, r"poses: expected shape \(5, 6, 3\)"),
-    ({"poses": np.full((5, 6, 3), np.inf)}, "true pose of run 0: expected finite"),
+    ({"poses": np.full((5, 6, 3), np.inf)}, "poses: expected finite numbers of run 0"),
     ({"landmarks": np.zeros((4, 2, 2))}, r"landmarks: expected shape \(5, N, 2\)"),
     ({"landmarks": np.zeros((0, 2))}, "tags below 0, the number of landmarks"),
     ({"starts": np.zeros(3)}, r"starts: expected shape \(5, 3\), got \(3,\)"),
-    ({"pose": (0.0, 0.0)}, r"pose: expected shape \(3,\)"),
+    ({"pose": (0.0, 0.0)}, r"pose: expected finite numbers of shape \(3,\)"),
     ({"origin": np.zeros((5, 6, 2))}, "origin: expected integer"),
 )
 def test_what_is_no_record_is_refused(changed):

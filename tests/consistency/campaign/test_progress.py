@@ -101,5 +101,5 @@ def test_a_campaign_has_a_bar_by_default_where_it_can_be_seen(capsys, monkeypatc
 
 def test_what_is_no_progress_is_refused_by_name():
     world = worlds.ring(5)
-    with pytest.raises(ValueError, match=r"expected progress as a function of \(runs done, runs\)"):
+    with pytest.raises(ValueError, match=r"progress: expected a function of \(runs done, runs\)"):
         monte_carlo(world, {"a": worlds.ekf(world)}, 10, worlds.key(), progress=True)

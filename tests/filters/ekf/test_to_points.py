@@ -15,7 +15,7 @@ from jaxslam.charts import RightInvariant
 from jaxslam.core.protocols import Basis
 from jaxslam.core.types import Log, Scan, Status
 from jaxslam.filters import CompressedEkfSlam, EkfSlam
-from jaxslam.filters._ekf.map_coordinates import ready, reduce, reduction
+from jaxslam.filters._ekf.map_coordinates import reduce, reduce_where_ready, reduction
 from jaxslam.linearize import Unscented
 
 MOTION = motion.Increment(np.diag([0.02, 0.02]) ** 2)
@@ -29,7 +29,7 @@ def camera(**options):
 
 SENSOR = camera(to_point=0.1)
 REDUCE = jax.jit(reduce, static_argnums=(2, 3))
-READY = jax.jit(ready, static_argnums=(1, 2))
+READY = jax.jit(lambda *arguments: reduce_where_ready(*arguments)[1], static_argnums=(1, 2))
 
 
 @cache

@@ -197,11 +197,11 @@ def test_gradient_and_float32():
 
 
 @refused(
-    ({"landmarks": np.zeros((3, 3))}, r"landmarks of shape \(at least 1, 2\)"),
+    ({"landmarks": np.zeros((3, 3))}, r"landmarks: expected shape \(at least 1, 2\)"),
     ({"landmarks": np.zeros((0, 2))}, "at least 1"),
-    ({"landmarks": np.full((2, 2), np.nan)}, "not finite"),
-    ({"tags": [0, 0, 1, 2, 3, 4]}, "different tags"),
-    ({"tags": [-1, 0, 1, 2, 3, 4]}, "different tags"),
+    ({"landmarks": np.full((2, 2), np.nan)}, "landmarks: expected finite numbers"),
+    ({"tags": [0, 0, 1, 2, 3, 4]}, "6 different ones"),
+    ({"tags": [-1, 0, 1, 2, 3, 4]}, "6 different ones"),
     ({"linearize": linearize.FirstEstimate()}, "is for estimated maps"),
     ({"linearize": linearize.Unscented(), "iterations": 2}, "does not iterate"),
     ({"correction": "whole"}, "sequential"),

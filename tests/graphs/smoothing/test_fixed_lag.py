@@ -127,5 +127,5 @@ def test_what_does_not_fit_is_refused(options):
 
 def test_a_scan_that_is_too_large_is_refused(short):
     world, log = short
-    with pytest.raises(ValueError, match="at most 2 measurement slots"):
+    with pytest.raises(ValueError, match="slots: expected at least 6, as a scan has, got 2"):
         run(FixedLag(world.motion, world.sensor, 6, 2), log, world.pose, world.pose_cov, KEY)

@@ -183,7 +183,7 @@ def test_those_of_points_and_of_poses_with_points_are_too():
 @pytest.mark.parametrize("pairs", [(1, 2), [[1, 2, 3], [4, 5, 6]], [[1.5, 2.0]]])
 def test_pairs_are_two_whole_numbers_each(pairs):
     """A table on its side would else be read as other pairs."""
-    with pytest.raises(ValueError, match=r"expected pairs of whole numbers, \(Q, 2\), got"):
+    with pytest.raises(ValueError, match=r"pairs: expected whole numbers, \(Q, 2\), got"):
         graphs.marginals(as_it_is(ring()), pairs=pairs)
 
 

@@ -191,9 +191,9 @@ def test_a_run_of_one_filter_has_the_figure_of_one_and_none_is_refused():
     assert len(_landmarks.run_map_figure(campaign).axes) == 1
     nothing = dataclasses.replace(campaign, first={})
     for draw in (_pose_errors.run_errors_figure, _landmarks.run_map_figure):
-        with pytest.raises(ValueError, match=f"{draw.__name__}: the campaign holds no run 0"):
+        with pytest.raises(ValueError, match=f"{draw.__name__}: campaign: it holds no run 0"):
             draw(nothing)
-        with pytest.raises(ValueError, match="the first argument: expected a Campaign, got"):
+        with pytest.raises(ValueError, match="campaign: expected a Campaign, got"):
             draw(campaign.first["ekf"])
     with pytest.raises(
         ValueError, match="expected an Estimate, got a Trace; give its field estimate"
