@@ -359,9 +359,11 @@ class _Rows(NamedTuple):
     longest_gap: float | None
 
     def truth(self, shift: float = 0.0) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, "n"]]:
-        """The truth at the times of the estimate less a shift [s], and where it is known."""
+        """The truth at the times of the estimate less a shift [s], and where it is known; elsewhere
+        the estimate, so that sums over masked rows stay finite."""
         at = self.time - shift
-        return known_poses(self.clock, self.path, at, self.longest_gap, geodesic_poses)
+        path, is_known = known_poses(self.clock, self.path, at, self.longest_gap, geodesic_poses)
+        return np.where(is_known[:, None], path, self.pose), is_known
 
     def velocity(self, shift: float) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, "n"]]:
         """The velocity of the truth at the times less a shift, in its own axes: of the estimate's

@@ -253,7 +253,7 @@ NINE = ",".join("0" * 9)
         (None, ["--every", "3"], "--every: expected a divisor of the 20 steps, got 3"),
         (None, ["--runs", "9"], "--runs: expected at most 3"),
         (None, ["--filters", "magic"], "--filters: unknown filter 'magic'"),
-        (None, ["--time-limit", "0"], "--time-limit: expected seconds above 0, got 0"),
+        (None, ["--time-limit", "0"], "--time-limit: expected a number above 0, got 0"),
         (None, ["--estimator", "prog {run}"], "expected a command with {run} and {estimate}"),
         (
             None,
