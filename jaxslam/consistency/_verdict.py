@@ -227,8 +227,9 @@ def doubts_on(
     explained = counts.get("asymmetric_steps", 0) + counts.get("indefinite_steps", 0)
     # A start without errors is singular for a few steps; that a run ends so is another matter.
     ends = counts.get("singular_ends", 0)
-    if ends or singular - explained > 0.5 * steps > 0:
-        at_end = f" and at the end of {ends:,} of {runs:,} runs" if ends else ""
+    is_mostly_singular = singular - explained > 0.5 * steps > 0
+    if ends or is_mostly_singular:
+        at_end = "" if is_mostly_singular else f" and at the end of {ends:,} of {runs:,} runs"
         doubts.append(
             f"the pose covariance is singular in {singular:,} of {steps:,} steps"
             f"{at_end}, which have no pose NEES: a direction is claimed to be known exactly; more "
