@@ -82,6 +82,7 @@ def score(
     landmarks = statistics.landmark_nees, statistics.regular_landmarks
     nees["landmarks"] = Nees(*(np.asarray(x, np.float64) for x in landmarks))
     faults = covariance_faults(pose, cov)
+    is_faulty = faults.asymmetric | faults.indefinite
     is_still = [
         (rows == rows[:, :1]).reshape(len(rows), -1).all(axis=1)
         for rows in map(np.asarray, (trace.estimate.pose, trace.estimate.pose_cov, truth.pose))
@@ -96,6 +97,8 @@ def score(
         "singular_steps": steps - nees["pose"].regular.sum(axis=1),
         "asymmetric_steps": faults.asymmetric.sum(axis=1),
         "indefinite_steps": faults.indefinite.sum(axis=1),
+        "faulty_ends": is_faulty[:, -1],
+        "singular_ends": ~nees["pose"].regular[:, -1] & ~is_faulty[:, -1],
         # Pose and covariance stay as they are, to the bit, while the robot moves.
         "constant": is_still[0] & is_still[1] & ~is_still[2],
     }

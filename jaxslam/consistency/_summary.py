@@ -59,8 +59,9 @@ class Summary:
     counts: dict[str, int]
     """runs (finite), not_finite, inaccurate, divergent, steps, measured (measurements in the logs),
     used and dropped measurements by `Status`, missed, singular_steps, asymmetric_steps,
-    indefinite_steps, constant, and, of filters that have them, landmarks removed, merged and
-    reduced, and searches exhausted. All but the first three are of the finite runs."""
+    indefinite_steps, faulty_ends, singular_ends, constant, and, of filters that have them,
+    landmarks removed, merged and reduced, and searches exhausted. All but the first three are of
+    the finite runs."""
     per_run: dict[str, np.ndarray]
     """(runs,) the average of each measure in each run, NaN without one: squares, radians."""
     not_finite_runs: list[int]

@@ -66,8 +66,9 @@ def judge(
     ideal EKF, and far beyond what the filter claims).
     optimistic: an interval lies above, covariances are claimed too small. If the tests disagree,
     the NEES decides.
-    incomplete: over 5 % (`_FAULTY`) of the runs are not finite, of the steps have a covariance that
-    is not symmetric or not positive definite, or of the runs have an estimate that is constant.
+    incomplete: over 5 % (`_FAULTY`) of the runs are not finite, of the steps or of the ends of runs
+    have a covariance that is not symmetric or not positive definite, or of the runs have an
+    estimate that is constant.
     The remaining runs may be the runs with small errors, so they excuse nothing.
     pessimistic: an interval lies below.
     incomplete: nothing was measured, or over half of what was measured, or of what was in view, was
@@ -150,12 +151,13 @@ def power_of(noticed: Mapping[str, tuple[float, float]]) -> str:
 
 
 def is_faulty(counts: Mapping[str, int]) -> bool:
-    """Whether over 5 % of the runs or steps are none that a filter may give: see `judge`."""
+    """Whether over 5 % of the runs, steps or ends are none that a filter may give: see `judge`."""
     runs, steps = counts["runs"], counts.get("steps", 0)
     bad_steps = max(counts.get("asymmetric_steps", 0), counts.get("indefinite_steps", 0))
     return (
         counts["not_finite"] > _FAULTY * (runs + counts["not_finite"])
         or bad_steps > _FAULTY * steps
+        or counts.get("faulty_ends", 0) > _FAULTY * runs
         or counts.get("constant", 0) > _FAULTY * runs
     )
 
@@ -223,10 +225,15 @@ def doubts_on(
         doubts.append(f"pose and covariance never change in {count:,} of {runs:,} runs")
     singular = counts.get("singular_steps", 0)
     explained = counts.get("asymmetric_steps", 0) + counts.get("indefinite_steps", 0)
-    if singular - explained > 0.5 * steps > 0:
+    # A start without errors is singular for a few steps; that a run ends so is another matter.
+    ends = counts.get("singular_ends", 0)
+    is_mostly_singular = singular - explained > 0.5 * steps > 0
+    if ends or is_mostly_singular:
+        at_end = "" if is_mostly_singular else f" and at the end of {ends:,} of {runs:,} runs"
         doubts.append(
-            f"the pose covariance is singular in {singular:,} of {steps:,} steps, which have no "
-            "pose NEES: a direction is claimed to be known exactly; more runs do not help"
+            f"the pose covariance is singular in {singular:,} of {steps:,} steps"
+            f"{at_end}, which have no pose NEES: a direction is claimed to be known exactly; more "
+            "runs do not help"
         )
     if 2 * (count := counts.get("inaccurate", 0)) > runs and count > counts.get("divergent", 0):
         doubts.append(

@@ -237,17 +237,28 @@ figure.savefig(sys.argv[1])
 """
 
 
-def test_a_figure_is_drawn_where_the_users_backend_and_latex_are_missing(tmp_path):
+def test_a_figure_is_drawn_where_the_users_backend_latex_or_settings_are_of_no_use(tmp_path):
     (tmp_path / "matplotlibrc").write_text("text.usetex: True\nsavefig.dpi: 20\n")
+    (tmp_path / "latin").mkdir()
+    (tmp_path / "latin" / "matplotlibrc").write_bytes("# Größe\nfont.size: 20\n".encode("latin-1"))
     without = {k: v for k, v in os.environ.items() if k not in ("MPLBACKEND", "MATPLOTLIBRC")}
     settings = {"MPLBACKEND": "module://of_a.notebook", "MATPLOTLIBRC": str(tmp_path)}
-    for name, more in {"usual": {}, "other": settings}.items():
+    latin = {"MATPLOTLIBRC": str(tmp_path / "latin")}
+    for name, folder, more in (
+        ("usual", tmp_path.parent, {}),
+        ("other", tmp_path.parent, settings),
+        ("latin", tmp_path.parent, latin),
+        ("here", tmp_path / "latin", {}),
+    ):
         subprocess.run(
             [sys.executable, "-W", "error", "-c", WITH_ITS_FIGURE, tmp_path / f"{name}.png"],
             check=True,
+            cwd=folder,
             env=without | more,
         )
-    assert (tmp_path / "other.png").read_bytes() == (tmp_path / "usual.png").read_bytes()
+    usual = (tmp_path / "usual.png").read_bytes()
+    for name in ("other", "latin", "here"):
+        assert (tmp_path / f"{name}.png").read_bytes() == usual, name
 
 
 def test_numbers_are_written_before_figures_and_one_that_fails_is_named(tmp_path, capsys):

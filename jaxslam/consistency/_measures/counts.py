@@ -34,6 +34,8 @@ MEANINGS = {
     "not symmetric or is not positive definite",
     "asymmetric_steps": "steps whose pose covariance is not symmetric, by more than rounding",
     "indefinite_steps": "steps whose pose covariance has a negative eigenvalue, beyond rounding",
+    "faulty_ends": "runs whose last pose covariance is not symmetric or has a negative eigenvalue",
+    "singular_ends": "runs whose last pose covariance has no inverse, but neither of these faults",
     "constant": "runs whose pose and covariance never change while the robot moves",
     "removed": "landmarks removed from the map",
     "merged": "pairs of landmarks made one",

@@ -5,18 +5,24 @@ Only this package draws. Figures are made without pyplot, without global state a
 column of a paper, with letters of the same size. Matplotlib's backend and settings are not used.
 """
 
+import contextlib
 import locale
 import os
 import sys
 
 try:
     import matplotlib
-except (ValueError, locale.Error):  # the user's backend, or locale, is not installed
+except (ValueError, OSError, locale.Error):
+    # The user's backend or locale is not installed, or the user's matplotlibrc cannot be read.
     from unittest import mock
 
     for _half_loaded in [name for name in sys.modules if name.partition(".")[0] == "matplotlib"]:
         del sys.modules[_half_loaded]
-    with mock.patch.dict(os.environ, {"MPLBACKEND": "agg", "LC_ALL": "C"}):
+    _settings = {"MPLBACKEND": "agg", "LC_ALL": "C", "MATPLOTLIBRC": os.devnull}
+    with contextlib.ExitStack() as _stack:
+        _stack.enter_context(mock.patch.dict(os.environ, _settings))
+        if os.path.exists("matplotlibrc"):  # which Matplotlib would take first
+            _stack.enter_context(contextlib.chdir(sys.prefix))
         import matplotlib  # noqa: F401
 
 from jaxslam._public import publish

@@ -62,12 +62,6 @@ def look(i: int) -> Look:
     }
 
 
-def check_font() -> None:
-    """Raise `Unusable` if Matplotlib has no font to write with: its own is missing or damaged."""
-    with loading("figures", "matplotlib"):
-        get_font(findfont(FontProperties()))
-
-
 @contextlib.contextmanager
 def own_settings() -> Iterator[None]:
     """A block, or by @own_settings() a function, in which Matplotlib has its defaults and ours.
@@ -82,6 +76,12 @@ def own_settings() -> Iterator[None]:
         matplotlib.rcParams["pdf.fonttype"] = 42  # TrueType, which publishers require
         matplotlib.rcParams["svg.hashsalt"] = "jaxslam"  # reproducible names of parts
         yield
+
+
+def check_font() -> None:
+    """Raise `Unusable` if Matplotlib has no font to write with: its own is missing or damaged."""
+    with loading("figures", "matplotlib"), own_settings():
+        get_font(findfont(FontProperties()))
 
 
 @own_settings()
