@@ -75,4 +75,5 @@ def campaign(names, steps=STEPS, **changes):
     fields["filters"] = {name: summary(name, i, steps) for i, name in enumerate(names)}
     fields["step_seconds"] = {name: 1e-6 * SLOW.get(name, 90.0 + 2 * len(name)) for name in names}
     fields["first"] = {name: run_of(name, steps) for name in names}
+    fields |= {"run_seconds": {}, "notes": (), "reference": ""}
     return Campaign(**(fields | changes))
