@@ -173,7 +173,7 @@ def test_the_states_beside_a_model_are_used(verify):
         ),
         (UNTOLD, "", "the length of 'u' is not known"),
         (GOOD + "\nf_jacobians = f_jacobian\n", "", "expected f_jacobian or f_jacobians, got both"),
-        (GOOD + "\nf_states = (1.0,)\n", "", "expected states of shapes (S, 3), (S, 1)"),
+        (GOOD + "\nf_states = (1.0,)\n", "", "states: expected shapes (S, 3), (S, 1)"),
         (MODELS.replace("return jaxslam.sensors", "return 1 / jaxslam.sensors"), "", "mine.py:9: "),
     ],
 )
