@@ -390,15 +390,14 @@ def correct_in_turn(
 
         return in_groups(correct_one, joint, measurements, 1, unmatched)
 
-    def correct_group(joint: Joint, group: Measurements) -> tuple[Joint, Correction]:
-        return _correct_group(filter, sensor, joint, group, gamma)
-
     size = joint.cov.shape[1]
     cached = size <= CACHED
     group_size = max(1, min(_GROUP_CACHED if cached else _GROUP_UNCACHED, z.shape[0]))
     if cached:
         # Padded once for the whole scan; columns of zeros stay zero.
         joint = joint._replace(cov=jnp.pad(joint.cov, ((0, 0), (0, -size % _LANES))))
+    # A partial, as a function here would be one more frame of the tracebacks in a user's model.
+    correct_group = partial(_correct_group, filter, sensor, gamma=gamma)
     joint, corrections = in_groups(correct_group, joint, measurements, group_size, unmatched)
     return joint._replace(cov=joint.cov[:, :size]), corrections
 

@@ -75,10 +75,10 @@ class Begun(Exception):
 def test_a_campaign_has_a_bar_by_default_where_it_can_be_seen(capsys, monkeypatch, terminal):
     bars = []
 
-    def begun(self, plan, todo):
-        bars.append(self.progress)
-        if self.progress is not None:
-            self.progress(3, 10)
+    def begun(self, plan, todo, report):
+        bars.append(report)
+        if report is not None:
+            report(3, 10)
         raise Begun
 
     monkeypatch.setattr(_work.Work, "compute", begun)
@@ -101,5 +101,5 @@ def test_a_campaign_has_a_bar_by_default_where_it_can_be_seen(capsys, monkeypatc
 
 def test_what_is_no_progress_is_refused_by_name():
     world = worlds.ring(5)
-    with pytest.raises(ValueError, match=r"expected progress as a function of \(runs done, runs\)"):
+    with pytest.raises(ValueError, match=r"progress: expected a function of \(runs done, runs\)"):
         monte_carlo(world, {"a": worlds.ekf(world)}, 10, worlds.key(), progress=True)
