@@ -228,10 +228,10 @@ def _marginals(state: _Compressed) -> tuple[jax.Array, jax.Array]:
     rows_0, area_cov = state.full.cov[index], state.area.cov[: len(index), : len(index)]
     # The diagonal blocks of P_BA,0 Ψ P_AB,0 alone, O(K²·N).
     decrease = jnp.einsum("nal,nak->nlk", by_landmark(rows_0), by_landmark(psi @ rows_0))
-    own = own_blocks(state.full.cov, capacity) - decrease
+    landmark_covs = own_blocks(state.full.cov, capacity) - decrease
     with_robot = by_landmark(phi[:3] @ rows_0)
     return (
-        own.at[state.slot].set(own_blocks(area_cov, count)),
+        landmark_covs.at[state.slot].set(own_blocks(area_cov, count)),
         with_robot.at[state.slot].set(by_landmark(area_cov[:3])),
     )
 
