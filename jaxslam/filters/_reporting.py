@@ -188,7 +188,7 @@ def has_distance(status: jax.Array) -> jax.Array:
     return (status == Status.FUSED) | (status == Status.REJECTED)
 
 
-def nothing_of(scan: Scan) -> Info:
+def info_of_ignored(scan: Scan) -> Info:
     """The `Info` of an ignored scan: every valid measurement is `Status.UNMATCHED`."""
     m, size_z = scan.z.shape
     return info_of(

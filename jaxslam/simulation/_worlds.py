@@ -95,8 +95,8 @@ class World(Component):
             "published": FrozenDict.of,
         }.items():
             self._check_field(name, check)
-        self._check_field("landmarks", _table_of(len(self.sensor.landmark)))
-        self._check_field("controls", _table_of(len(self.motion.controls)))
+        self._check_field("landmarks", _table_of(self.sensor.landmark))
+        self._check_field("controls", _table_of(self.motion.controls))
 
     def _check_field(self, name: str, check: Check) -> None:
         """Check a field, or a property of that name."""
@@ -343,13 +343,16 @@ def drive(
     return history
 
 
-def _table_of(columns: int) -> Check:
-    """The check of a table (N, columns) of finite numbers, N at least 1."""
+def _table_of(columns: tuple[str, ...]) -> Check:
+    """The check of a table (N, C) of finite numbers with these C columns, N at least 1."""
 
     def check(value: ArrayLike) -> ArrayLike:
         shape = np.shape(value)
-        if len(shape) != 2 or shape[1] != columns or shape[0] == 0:
-            raise ValueError(f"expected shape (N, {columns}) with N >= 1, got {shape}")
+        if len(shape) != 2 or shape[1] != len(columns) or shape[0] == 0:
+            raise ValueError(
+                f"expected shape (N, {len(columns)}) with N >= 1, a row of {', '.join(columns)} "
+                f"each, got {shape}"
+            )
         if is_concrete(value):  # no tracer, as when maps are drawn under vmap
             table = np.asarray(value)
             if not np.issubdtype(table.dtype, np.number) or not np.all(np.isfinite(table)):

@@ -5,9 +5,10 @@ from pathlib import Path
 
 import jax
 
+from jaxslam.core._validation import is_user_file
+
 _VERIFIER = str(Path(__file__).parent)
 _PACKAGE = str(Path(__file__).parents[1])
-_JAX = str(Path(jax.__file__).parent)
 
 
 def place_of_error(error: BaseException) -> str:
@@ -18,12 +19,6 @@ def place_of_error(error: BaseException) -> str:
     for frame in users + ours:
         return f"{Path(frame.filename).name}:{frame.lineno}"
     return ""
-
-
-def is_user_file(filename: str) -> bool:
-    """Whether a source file is the user's own, not a library's."""
-    libraries = (_JAX, _PACKAGE, "<")
-    return not (filename.startswith(libraries) or "site-packages" in filename)
 
 
 def describe_error(error: BaseException) -> str:

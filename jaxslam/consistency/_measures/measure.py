@@ -71,9 +71,9 @@ class RunScores(NamedTuple):
     """A measure of each of R runs."""
 
     total: np.ndarray
-    """(R,) the average within each run"""
+    """(R,) the sum within each run, whose number is total / weight"""
     weight: np.ndarray | int
-    """(R,) over how much; a run of weight 0 has no number"""
+    """(R,) the number of terms of the sum; a run of weight 0 has no number"""
     sums: Sums = MappingProxyType({})
     """(R, …) summed over the runs, for `Measure.curves`, by name"""
 

@@ -9,7 +9,7 @@ On a GPU particle filters agree to rounding alone (`docs/guide/campaigns.md`).
 """
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Literal, TypeVar
 
@@ -35,7 +35,7 @@ from jaxslam.consistency.campaign._pieces import cores, in_part, missing_pieces,
 from jaxslam.consistency.campaign._precision import precision_doubts
 from jaxslam.consistency.campaign._remote import Executor
 from jaxslam.consistency.campaign._result import Campaign, Incomplete, Interrupted
-from jaxslam.consistency.campaign._work import Work, show_progress
+from jaxslam.consistency.campaign._work import Report, Work, progress_report
 from jaxslam.core._numbers import is_concrete
 from jaxslam.core._reprs import describe
 from jaxslam.core.protocols import Candidate, Filter
@@ -68,7 +68,7 @@ def monte_carlo(
     dtype: DTypeLike | None = None,
     keep: Keep | None = None,
     part: tuple[int, int] | None = None,
-    progress: Callable[[int, int], None] | Literal[False] | None = None,
+    progress: Report | Literal[False] | None = None,
     executor: Executor | None = None,
 ) -> Campaign:
     """Run every filter over the same `runs` worlds of a scenario and sum up its consistency.
@@ -124,18 +124,18 @@ def monte_carlo(
             scenario, filters, runs, key, block, workers, devices, keep, part, progress, executor
         )
         began, runs = time.perf_counter(), int(runs)
+
+        # Plan: what is computed, where, and how many runs at once.
         devices = jax.local_devices() if devices is None else list(devices)
         if executor is not None:
             devices = devices[:1]  # as every worker
         dtype = check_dtype(dtype)
         if workers is None and executor is not None:
             workers = 64
-        if workers is None:
+        elif workers is None:
             # An accelerator computes a block while the host scores the one before: 1.4 times the
             # runs a second of one block at a time on an H100, and no more with three.
             workers = -(-cores() // len(devices)) if devices[0].platform == "cpu" else 2
-        names = (*filters, BOUND)
-        tallies = {name: Tally() for name in names}
         size = int(block or fitting_block(scenario, filters, devices[0]))
         near, near_filters, origin = near_the_origin(scenario, filters)
         plan = CampaignPlan(near, near_filters, key, devices, size, bound, dtype)
@@ -145,19 +145,26 @@ def monte_carlo(
                 f"expected one of the {-(-runs // plan.wide)} blocks of "
                 f"{plan.wide} runs that {runs} runs are, got part {part[0]} of {part[1]}",
             )
+
+        # Load the kept blocks; the missing ones of this part remain.
+        tallies = {name: Tally() for name in (*filters, BOUND)}
         finished: list[tuple[int, int]] = []
         if keep is not None:
             keep.claim(identity(scenario, filters, key, devices[0].platform, bound, dtype))
             finished = add_kept(tallies, keep, runs, lambda first: in_part(first, plan.wide, part))
         pieces = missing_pieces(finished, runs, plan.wide)
         todo = [piece for piece in pieces if in_part(piece[0], plan.wide, part)]
-        work = Work(workers, keep, progress or None, {name: Tally() for name in names}, executor)
+
+        # Compute. What is finished is summed up after an interruption, too.
+        work = Work(workers, keep, {name: Tally() for name in tallies}, executor)
         stop: KeyboardInterrupt | Incomplete | None = None
         try:
-            with show_progress(work, plan, progress is None):
-                work.compute(plan, todo)
+            with progress_report(progress, plan) as report:
+                work.compute(plan, todo, report)
         except (KeyboardInterrupt, Incomplete) as error:
             stop = error
+
+        # Sum up: the kept runs first, then those of this process.
         for name, tally in work.tallies.items():
             tallies[name].merge(tally)
         campaign = None

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import numpy as np
@@ -22,6 +22,9 @@ from jaxslam.consistency.campaign._progress import Progress
 from jaxslam.consistency.campaign._remote import Executor, compute_block, pack
 from jaxslam.core.types import Estimate, Truth
 
+Report = Callable[[int, int], None]
+"""(runs done, runs), called after each block."""
+
 
 @dataclass
 class Work:
@@ -30,7 +33,6 @@ class Work:
     workers: int
     """blocks in flight at once, beside one that waits"""
     keep: Keep | None
-    progress: Callable[[int, int], None] | None
     tallies: dict[str, Tally]
     """the results of this process, by filter"""
     executor: Executor | None = None
@@ -43,7 +45,9 @@ class Work:
         """The time of one run on one device, by filter: the median over finished blocks."""
         return {name: float(np.median(times)) for name, times in self.spent.items()}
 
-    def compute(self, plan: CampaignPlan, todo: Sequence[tuple[int, int]]) -> None:
+    def compute(
+        self, plan: CampaignPlan, todo: Sequence[tuple[int, int]], report: Report | None
+    ) -> None:
         """Add the pieces (first, runs) to the tallies, in blocks of half the size each time that
         memory does not suffice."""
         while todo:
@@ -56,14 +60,14 @@ class Work:
             try:
                 if self.executor is not None:
                     start = partial(self.executor.submit, compute_block, pack(plan))
-                    self._compute_queue(Flight(start, TRIES), queue, todo)
+                    self._compute_queue(Flight(start, TRIES), queue, todo, report)
                     return
                 runner = BlockRunner(plan)
                 runner.compile()
                 # XLA uses the cores; threads of the BLAS below its LAPACK would only spin.
                 with threadpool_limits(1, "blas"), ThreadPoolExecutor(self.workers) as pool:
                     submit: Any = pool.submit
-                    self._compute_queue(Flight(partial(submit, runner.block)), queue, todo)
+                    self._compute_queue(Flight(partial(submit, runner.block)), queue, todo, report)
                 return
             except (jax.errors.JaxRuntimeError, MemoryError) as error:
                 if not out_of_memory(error):
@@ -82,7 +86,11 @@ class Work:
                 plan = replace(plan, block=half)
 
     def _compute_queue(
-        self, flight: Flight, queue: list[tuple[int, int]], todo: Sequence[tuple[int, int]]
+        self,
+        flight: Flight,
+        queue: list[tuple[int, int]],
+        todo: Sequence[tuple[int, int]],
+        report: Report | None,
     ) -> None:
         """Compute the pieces of a queue, last first, and add them to the tallies.
 
@@ -108,8 +116,8 @@ class Work:
                         self.spent[name].append(seconds)
                     self.compile_seconds = max(self.compile_seconds, result.compile_seconds)
                     finished += count
-                    if self.progress is not None:
-                        self.progress(finished, total)
+                    if report is not None:
+                        report(finished, total)
             except BaseException as error:
                 if stop is not None:
                     raise
@@ -120,13 +128,20 @@ class Work:
 
 
 @contextlib.contextmanager
-def show_progress(work: Work, plan: CampaignPlan, wanted: bool) -> Iterator[None]:
-    """A context with an optional progress bar on a terminal or in a notebook."""
-    count = len(plan.filters)
-    bar = Progress(f"{plan.scenario.name}, {count} filter{'s' * (count > 1)}") if wanted else None
-    if bar is None or not bar.shown:
-        yield
+def progress_report(
+    progress: Report | Literal[False] | None, plan: CampaignPlan
+) -> Iterator[Report | None]:
+    """A context with the function that reports progress, None for no report.
+
+    progress: the user's function; False for none; None for a bar, on a terminal or in a notebook.
+    """
+    if progress is not None:
+        yield progress or None
         return
-    work.progress = bar
+    count = len(plan.filters)
+    bar = Progress(f"{plan.scenario.name}, {count} filter{'s' * (count > 1)}")
+    if not bar.shown:
+        yield None
+        return
     with bar:
-        yield
+        yield bar

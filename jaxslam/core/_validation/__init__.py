@@ -4,6 +4,7 @@ from jaxslam.core._validation.logs import log_of
 from jaxslam.core._validation.models import (
     check_models,
     checked_estimate,
+    is_user_file,
     motion_model,
     reworded_tracer_errors,
     same_state,
@@ -14,6 +15,7 @@ from jaxslam.core._validation.models import (
 __all__ = [
     "check_models",
     "checked_estimate",
+    "is_user_file",
     "log_of",
     "motion_model",
     "reworded_tracer_errors",

@@ -5,6 +5,7 @@ was expected.
 """
 
 import contextlib
+import sysconfig
 import traceback
 import weakref
 from collections.abc import Callable, Iterator
@@ -37,7 +38,12 @@ _NEEDS_VALUES = (
 )
 
 
-_PACKAGE = str(Path(__file__).parents[2])
+_LIBRARIES = (
+    str(Path(__file__).parents[2]),  # this package
+    str(Path(jax.__file__).parent),
+    sysconfig.get_path("stdlib"),  # as `dataclasses`, whose `replace` makes a user's record
+    "<",  # code without a file, as the __init__ of a dataclass
+)
 
 
 @contextlib.contextmanager
@@ -52,19 +58,27 @@ def reworded_tracer_errors() -> Iterator[None]:
     try:
         yield
     except _NEEDS_VALUES as error:
-        frames = traceback.extract_tb(error.__traceback__)
-        of_user = [
-            frame
-            for frame in frames
-            if "site-packages" not in frame.filename and not frame.filename.startswith(_PACKAGE)
-        ]
-        last = (of_user or frames)[-1]
-        raise InvalidField(
-            "",
-            f"{Path(last.filename).name}:{last.lineno}, in {last.name}, needs the value of an "
-            "array, which is not known while JAX traces: write jnp.where or lax.cond in place of "
-            "`if`, jax.numpy in place of NumPy, and no float(…)",
-        ) from error
+        place = _place_in_user_code(error)
+        raise InvalidField("", f"{place}, {_NEEDS_VALUES_HINT}") from error
+
+
+_NEEDS_VALUES_HINT = (
+    "needs the value of an array, which is not known while JAX traces: write jnp.where or lax.cond "
+    "in place of `if`, jax.numpy in place of NumPy, and no float(…)"
+)
+
+
+def is_user_file(filename: str) -> bool:
+    """Whether a source file is the user's own, not a library's."""
+    return not (filename.startswith(_LIBRARIES) or "site-packages" in filename)
+
+
+def _place_in_user_code(error: Exception) -> str:
+    """The innermost line of a user's code in a traceback, as "camp.py:12, in observe"."""
+    frames = traceback.extract_tb(error.__traceback__)
+    of_user = [frame for frame in frames if is_user_file(frame.filename)]
+    last = (of_user or frames)[-1]
+    return f"{Path(last.filename).name}:{last.lineno}, in {last.name}"
 
 
 def check_models(motion: object, sensor: object) -> None:
@@ -143,7 +157,10 @@ def _check_size(
         result = jax.eval_shape(function, *arguments.values())
     except Exception as error:
         line = next(iter(str(error).strip().splitlines()), "")
-        raise InvalidField("", f"{call} fails: {type(error).__name__}: {line}") from error
+        why = f"{type(error).__name__}: {line}"
+        if isinstance(error, _NEEDS_VALUES):
+            why = f"it {_NEEDS_VALUES_HINT}"
+        raise InvalidField("", f"{call} fails at {_place_in_user_code(error)}: {why}") from error
     result_shape = getattr(result, "shape", None)
     if result_shape != shape:
         got = with_article(type(result).__name__)

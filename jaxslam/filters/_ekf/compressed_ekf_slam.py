@@ -147,10 +147,10 @@ class CompressedEkfSlam(Wrapper):
     @property
     def _local(self) -> EkfSlam:
         """The filter of the area, with slots for the postponed update."""
-        area = min(self.area, self.filter.capacity)
+        count = min(self.area, self.filter.capacity)
         # A capacity is a shape, so the filter of the area is another record with the same models.
-        spare = _postponed_slots(area, len(self.filter.sensor.landmark))
-        return dataclasses.replace(self.filter, capacity=area + spare)
+        postponed = _postponed_slots(count, len(self.filter.sensor.landmark))
+        return dataclasses.replace(self.filter, capacity=count + postponed)
 
 
 def open_area(joint: Joint, area: int) -> _Compressed:
@@ -161,140 +161,139 @@ def open_area(joint: Joint, area: int) -> _Compressed:
 def up_to_date(state: _Compressed) -> Joint:
     """The map with the postponed update applied, O(K·N²)."""
     joint = state.full
-    at = _rows(state.slot, joint.landmarks.shape[1])
-    before = joint.cov[at]
+    index = _rows(state.slot, joint.landmarks.shape[1])
+    rows_0 = joint.cov[index]  # of A, [P_AA,0 P_AB,0] in the order of the map
     phi, psi, _ = _postponed_update(state)
     # P_BB; the rows and columns of A that this touches too are overwritten below, P_AB by Φ P_AB,0.
-    cov = joint.cov - linalg.symmetrize(before.T @ (psi @ before))
-    now = (phi @ before).at[:, at].set(state.area.cov[: len(at), : len(at)])
+    cov = joint.cov - linalg.symmetrize(rows_0.T @ (psi @ rows_0))
+    rows = (phi @ rows_0).at[:, index].set(state.area.cov[: len(index), : len(index)])
     return joint._replace(
         pose=state.area.pose,
         landmarks=_move_map(state),
-        cov=cov.at[at].set(now).at[:, at].set(now.T),
+        cov=cov.at[index].set(rows).at[:, index].set(rows.T),
     )
 
 
-def _with_area_of(scan: Scan, state: _Compressed, sensor: Sensor, most: int | None) -> _Compressed:
-    """The state with an area that holds the landmarks of a scan: the same, or another one.
-
-    most: new landmarks a scan.
-    """
-    joint, area = state.full, state.slot.shape[0]
+def _with_area_of(
+    scan: Scan, state: _Compressed, sensor: Sensor, births: int | None
+) -> _Compressed:
+    """The state with an area that holds the landmarks of a scan: the same, or another one."""
+    joint, count = state.full, state.slot.shape[0]
     tagged = scan.valid & (scan.tag >= 0)
     slot, in_map = slots.find(joint.tag, joint.alive, scan.tag)
     seen = jnp.zeros(joint.alive.shape, bool).at[slot].max(tagged & in_map)
     # Counts repeated tags twice, and so may open an area too early, never too late.
-    new = jnp.minimum((tagged & ~in_map).sum(), scan.tag.shape[0] if most is None else most)
-    room, room_anywhere = (~state.area.alive).sum(), (~joint.alive).sum()
+    new = jnp.minimum((tagged & ~in_map).sum(), scan.tag.shape[0] if births is None else births)
+    free_in_area, free_in_map = (~state.area.alive).sum(), (~joint.alive).sum()
     outside = seen & ~jnp.zeros(joint.alive.shape, bool).at[state.slot].set(True)
-    # Another area helps new landmarks only if the map has more room than this one.
-    leave = outside.any() | ((new > room) & (room_anywhere > room))
+    # Another area helps new landmarks only if the map has more free slots than this one.
+    must_move = outside.any() | ((new > free_in_area) & (free_in_map > free_in_area))
 
     def reopen(state: _Compressed) -> _Compressed:
         joint = up_to_date(state)
         # The result of a run must not depend on other runs of the batch.
-        opened = _open_at(joint, _choose_area(joint, area, sensor, seen, new))
-        chosen: _Compressed = jax.tree.map(lambda a, b: jnp.where(leave, a, b), opened, state)
+        opened = _open_at(joint, _choose_area(joint, count, sensor, seen, new))
+        chosen: _Compressed = jax.tree.map(lambda a, b: jnp.where(must_move, a, b), opened, state)
         return chosen
 
-    after: _Compressed = where_any(leave, reopen, lambda state: state, state)
+    after: _Compressed = where_any(must_move, reopen, lambda state: state, state)
     return after
 
 
 def _move_map(state: _Compressed) -> jax.Array:
     """The current landmarks (N, L)."""
-    landmarks, area = state.full.landmarks, state.slot.shape[0]
+    landmarks, count = state.full.landmarks, state.slot.shape[0]
     theta = _postponed_update(state)[2]
     # P_BA,0 θ for all landmarks, O(K·N); those of the area are set to its own.
-    moved = (theta @ state.full.cov[_rows(state.slot, landmarks.shape[1])])[3:]
-    return (
-        (landmarks + moved.reshape(landmarks.shape)).at[state.slot].set(state.area.landmarks[:area])
-    )
+    change = (theta @ state.full.cov[_rows(state.slot, landmarks.shape[1])])[3:]
+    landmarks = landmarks + change.reshape(landmarks.shape)
+    return landmarks.at[state.slot].set(state.area.landmarks[:count])
 
 
 def _marginals(state: _Compressed) -> tuple[jax.Array, jax.Array]:
-    """The current P of each landmark with itself (N, L, L) and with the robot (N, 3, L)."""
-    capacity, size = state.full.landmarks.shape
-    area, at = state.slot.shape[0], _rows(state.slot, size)
+    """The current P of each landmark with itself (N, L, L) and of the robot with it (N, 3, L)."""
+    capacity, size_l = state.full.landmarks.shape
+    count, index = state.slot.shape[0], _rows(state.slot, size_l)
 
     def by_landmark(rows: jax.Array) -> jax.Array:
-        return rows[:, 3:].reshape(len(rows), -1, size).transpose(1, 0, 2)
+        """The columns of the landmarks, (N, rows, L)."""
+        return rows[:, 3:].reshape(len(rows), -1, size_l).transpose(1, 0, 2)
 
-    def with_itself(cov: jax.Array, count: int) -> jax.Array:
+    def own_blocks(cov: jax.Array, count: int) -> jax.Array:
         k = jnp.arange(count)
         # Landmarks by number and entry, (count, L, count, L): the diagonal blocks.
-        return cov[3:, 3:].reshape(count, size, count, size)[k, :, k]
+        return cov[3:, 3:].reshape(count, size_l, count, size_l)[k, :, k]
 
     phi, psi, _ = _postponed_update(state)
-    before, inside = state.full.cov[at], state.area.cov[: len(at), : len(at)]
+    rows_0, area_cov = state.full.cov[index], state.area.cov[: len(index), : len(index)]
     # The diagonal blocks of P_BA,0 Ψ P_AB,0 alone, O(K²·N).
-    lost = jnp.einsum("nal,nak->nlk", by_landmark(before), by_landmark(psi @ before))
-    alone = with_itself(state.full.cov, capacity) - lost
-    with_robot = by_landmark(phi[:3] @ before)
+    decrease = jnp.einsum("nal,nak->nlk", by_landmark(rows_0), by_landmark(psi @ rows_0))
+    landmark_covs = own_blocks(state.full.cov, capacity) - decrease
+    with_robot = by_landmark(phi[:3] @ rows_0)
     return (
-        alone.at[state.slot].set(with_itself(inside, area)),
-        with_robot.at[state.slot].set(by_landmark(inside[:3])),
+        landmark_covs.at[state.slot].set(own_blocks(area_cov, count)),
+        with_robot.at[state.slot].set(by_landmark(area_cov[:3])),
     )
 
 
 def _postponed_update(state: _Compressed) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """The postponed update Φ, Ψ (W, W) and θ (W,), W = 3 + K·L."""
+    """The postponed update Φ, Ψ (W, W) and θ (W,), W = 3 + K·L, out of the area's [P Φ; Φᵀ -Ψ]."""
     area, count = state.area, state.slot.shape[0]
     width = 3 + count * area.landmarks.shape[1]
-    # The last of the spare slots may be used in part.
+    # The last of the postponed slots may be used in part.
     theta = area.landmarks[count:].reshape(-1)[:width]
-    return (
-        area.cov[:width, width : 2 * width],
-        -area.cov[width : 2 * width, width : 2 * width],
-        theta,
-    )
+    phi = area.cov[:width, width : 2 * width]
+    psi = -area.cov[width : 2 * width, width : 2 * width]
+    return phi, psi, theta
 
 
 def _open_at(joint: Joint, slot: jax.Array) -> _Compressed:
     """The state with nothing postponed and the landmarks of slots (K,) as its area."""
-    count, size = slot.shape[0], joint.landmarks.shape[1]
-    at, spare = _rows(slot, size), _postponed_slots(count, size)
-    inside = joint.cov[at][:, at]
+    count, size_l = slot.shape[0], joint.landmarks.shape[1]
+    index, postponed = _rows(slot, size_l), _postponed_slots(count, size_l)
+    area_cov = joint.cov[index][:, index]
     # Φ = 1, Ψ = 0, θ = 0; Φ of a dead slot is 0, since a landmark that starts there adds to zeros.
-    living = jnp.concatenate([jnp.ones(3, bool), jnp.repeat(joint.alive[slot], size)])
-    phi = jnp.diag(living.astype(inside.dtype))
-    cov = jnp.zeros((len(at) + spare * size,) * 2, inside.dtype)
-    cov = cov.at[: 2 * len(at), : 2 * len(at)].set(jnp.block([[inside, phi], [phi, 0 * phi]]))
+    living = jnp.concatenate([jnp.ones(3, bool), jnp.repeat(joint.alive[slot], size_l)])
+    phi = jnp.diag(living.astype(area_cov.dtype))
+    blocks = jnp.block([[area_cov, phi], [phi, 0 * phi]])
+    cov = jnp.zeros((len(index) + postponed * size_l,) * 2, area_cov.dtype)
+    cov = cov.at[: len(blocks), : len(blocks)].set(blocks)
+    theta = jnp.zeros((postponed, size_l), area_cov.dtype)
     area = Joint(
         pose=joint.pose,
-        landmarks=jnp.concatenate([joint.landmarks[slot], jnp.zeros((spare, size), inside.dtype)]),
+        landmarks=jnp.concatenate([joint.landmarks[slot], theta]),
         cov=cov,
         # Alive, so that no new landmark takes these slots; without a tag that a scan can have.
-        alive=jnp.concatenate([joint.alive[slot], jnp.ones(spare, bool)]),
-        tag=jnp.concatenate([joint.tag[slot], jnp.full(spare, _NONE, joint.tag.dtype)]),
+        alive=jnp.concatenate([joint.alive[slot], jnp.ones(postponed, bool)]),
+        tag=jnp.concatenate([joint.tag[slot], jnp.full(postponed, _NONE, joint.tag.dtype)]),
         lin=joint.lin,
     )
     return _Compressed(joint, area, slot)
 
 
 def _choose_area(
-    joint: Joint, area: int, sensor: Sensor, seen: jax.Array, new: jax.Array
+    joint: Joint, count: int, sensor: Sensor, seen: jax.Array, new: jax.Array
 ) -> jax.Array:
     """The slots (K,) of a new area, ascending: those seen, free ones, the nearest to the pose."""
     points = jax.vmap(sensor.position)(joint.landmarks)
     distance = ((points - joint.pose[None, :2]) ** 2).sum(axis=1)
     # A quarter of the area is reserved for new landmarks, each of which would need a new area.
-    spare = jnp.cumsum(~joint.alive) <= jnp.maximum(new, area // 4)
+    is_reserve = jnp.cumsum(~joint.alive) <= jnp.maximum(new, count // 4)
     # Free slots in the order in which the whole map would fill them; more of them than the reserve
     # only where the map has too few landmarks for the area.
-    rank = jnp.select([seen, ~joint.alive & spare, joint.alive], [0, 1, 2], 3)
+    rank = jnp.select([seen, ~joint.alive & is_reserve, joint.alive], [0, 1, 2], 3)
     distance = jnp.where(joint.alive, distance, 0.0)
     # By rank, then distance (the last key is the first); ascending, as `slots.allocate` takes them,
     # so that a new landmark gets the slot that it would get in the whole map.
-    return jnp.sort(jnp.lexsort((distance, rank))[:area]).astype(jnp.int32)
+    return jnp.sort(jnp.lexsort((distance, rank))[:count]).astype(jnp.int32)
 
 
-def _rows(slot: jax.Array, size: int) -> jax.Array:
-    """The rows of the robot and of the landmarks in slots (K,), (3 + K·L,)."""
-    of_landmarks = 3 + slot[:, None] * size + jnp.arange(size)[None, :]
+def _rows(slot: jax.Array, size_l: int) -> jax.Array:
+    """The rows of P of the robot and of the landmarks in slots (K,), (3 + K·L,)."""
+    of_landmarks = 3 + slot[:, None] * size_l + jnp.arange(size_l)[None, :]
     return jnp.concatenate([jnp.arange(3), of_landmarks.reshape(-1)])
 
 
-def _postponed_slots(area: int, size: int) -> int:
-    """The number of landmark slots that hold 3 + K·size variables."""
-    return -(-(3 + area * size) // size)
+def _postponed_slots(count: int, size_l: int) -> int:
+    """The number of landmark slots (L each) that hold Φ's 3 + count·L variables, rounded up."""
+    return -(-(3 + count * size_l) // size_l)

@@ -4,8 +4,10 @@
 
 With the gain K = P Hᵀ S⁻¹ = Vᵀ L⁻¹ this is x ← x ⊞ K ν and P ← P - K S Kᵀ, symmetric as it stands.
 `correct` does this for a whole scan, `correct_in_turn` for each measurement at the estimate that
-those before it left. Both use the sparsity of H, which involves the robot and one landmark
-(`whitening`).
+those before it left. Both compute ν, S and the gate in `_innovate`, and use the sparsity of H,
+which involves the robot and one landmark (`whitening`).
+
+Letters: m measurements, Z numbers in one of them, L in a landmark, D = 3 + N·L of the state.
 """
 
 from collections.abc import Callable
@@ -129,7 +131,7 @@ def _correct(
     matched: Bool[Array, "m"],
     gamma: Number | None,
 ) -> tuple[Joint, Correction]:
-    """The joint corrected at once, with the largest d² within the gate at hand."""
+    """The joint corrected at once. gamma: the largest d² that passes the gate, None without one."""
     innovation = _innovate(filter, sensor, joint, slot, z, matched, (joint, slot), gamma)
     cov = _correct_cov(joint.cov, innovation, filter.covariance)
     pose, landmarks = retract_map(filter.chart, joint, innovation.xi)
@@ -154,7 +156,7 @@ class _Innovation(NamedTuple):
     hx: Float[Array, "m Z D"]
     """H X of a square-root filter, else H P"""
     noise: Float[Array, "m Z Z"]
-    """R(ẑ) with the linearizer's addition"""
+    """R(ẑ), and the covariance that the linearizer adds to it"""
     fuse: Bool[Array, "m"]
     """matched, inside the gate, and with a positive definite S_ii"""
     correction: Correction
@@ -176,27 +178,29 @@ def _innovate(
         robot (3, D)         by pose (m, Z, 3)       (m·Z, D)     (m, Z, m, Z) = L Lᵀ
         landmark (m, L, D)   by landmark (m, Z, L)   V = L⁻¹ H P  ξ = Vᵀ L⁻¹ ν (D,)
 
-    Gate, reported numbers and R(ẑ) are those of the first iteration. ẑ of a later one depends on
-    the noise of z, as z itself does (`predicted_noise`), by the share of the gain.
+    Gate, reported numbers and R(ẑ) are those of the first iteration: a later ẑ has moved towards z,
+    so R there would depend on the noise of z (`predicted_noise` says why it must not).
 
-    memory: the state with the linearizer's memory, and the landmarks' slots (m,) there. P may have
-    further columns, of other errors.
+    memory: the state with the linearizer's memory, and the landmarks' slots (m,) there. It is
+    (joint, slot), unless joint is the local map of a group (`_correct_group`), whose slots differ.
+    P may have further columns, of other errors.
     """
     square_root = filter.covariance == "square_root"
     landmark_rows = jax.vmap(slots.gather, in_axes=(None, 0))(joint, slot)[1]
     # P (m, 3+L, 3+L) of the robot and the landmark of each measurement.
     local_cov = jax.vmap(partial(slots.local_cov, joint, square_root=square_root))(slot)
     m, size_z = z.shape
-    same = jnp.eye(m, dtype=z.dtype)[:, None, :, None]  # (m, 1, m, 1): same * R is block diagonal
+    diagonal = jnp.eye(m, dtype=z.dtype)[:, None, :, None]  # (m, 1, m, 1): times R, diagonal blocks
     xi: jax.Array | None = None
     for i in range(filter.iterations):
         # (26), with H of (25) by the pose and one landmark.
-        h_nu, z_hat, rest, jacobian = _linearize(
+        h_nu, z_hat, added_noise, jacobian = _linearize(
             filter, sensor, joint, slot, local_cov, z, memory, xi
         )
         by_pose, by_landmark, nu = h_nu[:, :, :3], h_nu[:, :, 3:-1], h_nu[:, :, -1]
         if i == 0:
-            noise = jax.vmap(partial(predicted_noise, sensor))(z_hat, z, matched) + rest
+            noise = jax.vmap(partial(predicted_noise, sensor))(z_hat, z, matched)
+            noise = noise + added_noise
         # (m·Z) D entries, each of which P - Vᵀ V needs D times.
         hp = hx = no_inline(project, h_nu, joint.cov[:3], landmark_rows)
         if square_root:
@@ -204,7 +208,7 @@ def _innovate(
             hp = materialize((hx.reshape(m * size_z, -1) @ joint.cov.T).reshape(hx.shape))
         # (27): H P Hᵀ + R for all pairs of measurements.
         s = projected_cov(hp, by_pose, by_landmark, slot, joint.landmarks.shape[0])
-        s = s + same * noise[:, :, None]
+        s = s + diagonal * noise[:, :, None]
         # (m, Z, Z): index arrays on both sides of a slice put their axis first.
         s_ii = s[jnp.arange(m), :, jnp.arange(m)]
         # Stored: each of the D columns of L⁻¹ H P needs it.
@@ -261,20 +265,22 @@ def _linearize(
     Float[Array, "m Z Z"],
     tuple[Float[Array, "m Z 3"], Float[Array, "m Z L"]],
 ]:
-    """The linearization z ≈ ẑ + H (ξ - ξ_i) at the prior retract_map by ξ_i; None: at the prior.
+    """The linearization z ≈ ẑ + H (ξ - ξ_i) at x ⊞ ξ_i; xi = None: at the prior x.
 
     Returns H by the errors with ν = z - ẑ + H ξ_i beside it, so that the solution is ξ, relative to
-    the prior; ẑ; the linearizer's addition to R; and H by the coordinates of pose and landmark.
+    the prior; ẑ; the covariance that the linearizer adds to R; and H by the coordinates of pose and
+    landmark.
     """
     state, slot_in_state = memory
-    chart, prior = filter.chart, joint.landmarks[slot]
-    pose, landmark, moved = joint.pose, prior, None
+    chart, prior_landmark = filter.chart, joint.landmarks[slot]
+    pose, landmark, errors = joint.pose, prior_landmark, None
     if xi is not None:
         capacity, size_l = joint.landmarks.shape
-        moved = xi[:3], xi[3 : 3 + capacity * size_l].reshape(capacity, size_l)[slot]
+        # ξ_i of the robot, and of the landmark of each measurement.
+        errors = xi[:3], xi[3 : 3 + capacity * size_l].reshape(capacity, size_l)[slot]
         over_landmarks = jax.vmap(chart.retract, in_axes=(None, 0, None, 0))
-        poses, landmark = over_landmarks(joint.pose, prior, *moved)
-        pose = poses[0]
+        poses, landmark = over_landmarks(joint.pose, prior_landmark, *errors)
+        pose = poses[0]  # the same for all landmarks
 
     def observe(
         at: Int[Array, ""], landmark: Float[Array, "L"], cov: Float[Array, "3+L 3+L"]
@@ -282,22 +288,22 @@ def _linearize(
         point = LinearizationPoint(state, chart, pose, cov, at, landmark)
         return filter.linearize.observe(at_slot(sensor, state, at), point)
 
-    z_hat, by_pose, by_landmark, rest = jax.vmap(observe)(slot_in_state, landmark, local_cov)
+    z_hat, by_pose, by_landmark, added_noise = jax.vmap(observe)(slot_in_state, landmark, local_cov)
     # z ⊖ ẑ, with angles wrapped: the sensor's own difference.
     nu = jax.vmap(sensor.residual)(z, z_hat)
     jacobian = by_pose, by_landmark
     # The monitor takes H by coordinates; P is of errors in the chart, so the gain needs H by these.
     if chart.basis is not None:
         by_pose, by_landmark = chart_jacobians(
-            chart, joint.pose, prior, by_pose, by_landmark, moved
+            chart, joint.pose, prior_landmark, by_pose, by_landmark, errors
         )
-    if moved is not None:
+    if errors is not None:
         # Back to the prior: z - h(x_i) + H ξ_i.
-        nu = nu + jnp.einsum("mzi,i->mz", by_pose, moved[0])
-        nu = nu + jnp.einsum("mzi,mi->mz", by_landmark, moved[1])
+        nu = nu + jnp.einsum("mzi,i->mz", by_pose, errors[0])
+        nu = nu + jnp.einsum("mzi,mi->mz", by_landmark, errors[1])
     # One array, and so one kernel and not three.
     h_nu = materialize(jnp.concatenate([by_pose, by_landmark, nu[:, :, None]], axis=2))
-    return h_nu, z_hat, rest, jacobian
+    return h_nu, z_hat, added_noise, jacobian
 
 
 def _correct_cov(
@@ -315,33 +321,34 @@ def _correct_cov(
         return cov - linalg.self_gram(v)
     m, size_z = noise.shape[:2]
     rows = m * size_z
-    same = jnp.eye(m, dtype=noise.dtype)[:, None, :, None]  # (m, 1, m, 1): block diagonal
+    diagonal = jnp.eye(m, dtype=noise.dtype)[:, None, :, None]  # (m, 1, m, 1): diagonal blocks
     if form == "joseph":
-        # In O(D²): first the factor on the left, then that on the right.
-        fused_noise = jnp.where(fuse[:, None, None, None], same * noise[:, :, None], 0.0)
+        # O(m·Z·D²): (I - KH) P first, then its product with (I - KH)ᵀ. No D×D matrices are
+        # multiplied.
+        fused_noise = jnp.where(fuse[:, None, None, None], diagonal * noise[:, :, None], 0.0)
         # K = P Hᵀ S⁻¹ = Vᵀ L⁻¹, so Lᵀ Kᵀ = V: backward substitution, by the flipped system.
         gain = linalg.solve_lower(factor[::-1, ::-1].T, v[::-1])[::-1].T
         noise = fused_noise.reshape(rows, rows)
-        left = cov - gain @ innovation.hp
+        one_sided = cov - gain @ innovation.hp  # (I - KH) P
         # (I - KH) P Hᵀ, with H P Hᵀ = S - R. Where not fused, S is the identity, but K is zero.
-        left_h = innovation.hp.T - gain @ (innovation.s.reshape(rows, rows) - noise)
-        return linalg.symmetrize(left - left_h @ gain.T + gain @ noise @ gain.T)
-    root = jax.vmap(lambda cov: linalg.cholesky(cov)[0])(noise)
+        one_sided_h = innovation.hp.T - gain @ (innovation.s.reshape(rows, rows) - noise)
+        return linalg.symmetrize(one_sided - one_sided_h @ gain.T + gain @ noise @ gain.T)
+    noise_root = jax.vmap(lambda cov: linalg.cholesky(cov)[0])(noise)
     unit = jnp.eye(size_z, dtype=noise.dtype)
     # (m, Z, m, Z); a unit pivot where not fused, so that L + N is regular. V is zero there.
-    root = same * jnp.where(fuse[:, None, None], root, unit)[:, :, None]
-    root = factor + root.reshape(rows, rows)
+    noise_root = diagonal * jnp.where(fuse[:, None, None], noise_root, unit)[:, :, None]
+    factor_sum = factor + noise_root.reshape(rows, rows)  # L + N
     hx = innovation.hx.reshape(rows, -1)
-    return cov - linalg.gram(v, materialize(linalg.solve_lower(root, hx)))
+    return cov - linalg.gram(v, materialize(linalg.solve_lower(factor_sum, hx)))
 
 
-# A pass over a P in the cache is bound by arithmetic, on vectors of this many entries (512 bits of
-# float32), and the rest of a row costs as much as a whole vector.
 _LANES = 16
+"""Entries of a vector register, 512 bits of float32. A pass over a P in the cache is bound by
+arithmetic, and the rest of a row that fills no vector costs as much as a whole one."""
 
-# Measurements a pass over P, where P is cached and where it is not: the fastest by measurement.
-# More of them cost more loads of P_I, fewer cost more loads of P.
-_GROUP, _GROUP_BEYOND = 3, 4
+_GROUP_CACHED, _GROUP_UNCACHED = 3, 4
+"""Measurements a pass over P, where P is cached and where it is not: the fastest by measurement.
+More of them cost more loads of P_I, fewer cost more loads of P."""
 
 _State = TypeVar("_State")
 
@@ -375,24 +382,23 @@ def correct_in_turn(
     """
     gamma = gate_quantile(filter.gate, len(sensor.measurements))
     measurements = z, slot, matched
-    nothing = partial(no_correction, joint, chart=filter.chart)
+    unmatched = partial(no_correction, joint, chart=filter.chart)
     if filter.covariance != "plain":
 
         def correct_one(joint: Joint, measurement: Measurements) -> tuple[Joint, Correction]:
             return _correct(filter, sensor, joint, *measurement, gamma)
 
-        return in_groups(correct_one, joint, measurements, 1, nothing)
-
-    def correct_group(joint: Joint, group: Measurements) -> tuple[Joint, Correction]:
-        return _correct_group(filter, sensor, joint, group, gamma)
+        return in_groups(correct_one, joint, measurements, 1, unmatched)
 
     size = joint.cov.shape[1]
     cached = size <= CACHED
-    group_size = max(1, min(_GROUP if cached else _GROUP_BEYOND, z.shape[0]))
+    group_size = max(1, min(_GROUP_CACHED if cached else _GROUP_UNCACHED, z.shape[0]))
     if cached:
         # Padded once for the whole scan; columns of zeros stay zero.
         joint = joint._replace(cov=jnp.pad(joint.cov, ((0, 0), (0, -size % _LANES))))
-    joint, corrections = in_groups(correct_group, joint, measurements, group_size, nothing)
+    # A partial, as a function here would be one more frame of the tracebacks in a user's model.
+    correct_group = partial(_correct_group, filter, sensor, gamma=gamma)
+    joint, corrections = in_groups(correct_group, joint, measurements, group_size, unmatched)
     return joint._replace(cov=joint.cov[:, :size]), corrections
 
 
@@ -401,11 +407,11 @@ def in_groups(
     state: _State,
     measurements: Measurements,
     group_size: int,
-    nothing: Callable[[Measurements], Correction],
+    unmatched: Callable[[Measurements], Correction],
 ) -> tuple[_State, Correction]:
     """The state after work(state, g measurements) on each group of m, and the m corrections.
 
-    nothing: the `Correction` of measurements without a match.
+    unmatched: the `Correction` of a group without a match, in which the state does not change.
     """
     m = len(measurements[0])
     groups = -(-m // group_size)  # ⌈m/g⌉
@@ -416,8 +422,8 @@ def in_groups(
         return full.reshape(groups, group_size, *values.shape[1:])
 
     def step(state: _State, group: Measurements) -> tuple[_State, Correction]:
-        unused, matched = nothing(group), group[2]
-        return where_any(matched.any(), lambda s: work(s, group), lambda s: (s, unused), state)
+        skipped, matched = unmatched(group), group[2]
+        return where_any(matched.any(), lambda s: work(s, group), lambda s: (s, skipped), state)
 
     state, corrections = jax.lax.scan(step, state, jax.tree.map(pad, measurements))
 
@@ -436,8 +442,8 @@ def _correct_group(
 ) -> tuple[Joint, Correction]:
     """The joint corrected by g measurements in turn: local states by each, then P by all at once.
 
-        local P (W, W) | M (W, W)    P_I of now = M P_I of before, W = 3 + g·L
-        V (g·Z, D) = reach (g·Z, W) P_I of before
+        local P (W, W) | M (W, W)     P_I after some measurements = M P_I of before, W = 3 + g·L
+        V = L⁻¹ H P = L⁻¹ H M P_I     (g·Z, D), with L⁻¹ H M (g·Z, W), `whitened_hm`
 
     P may have columns of zeros beyond its own.
     """
@@ -446,12 +452,12 @@ def _correct_group(
     # Slot i owns rows 3 + i·L to 3 + (i+1)·L of P. Of a landmark that the group measures twice, the
     # local map has two copies; a correction moves both by the same numbers.
     of_landmarks = 3 + slot[:, None] * size_l + jnp.arange(size_l, dtype=slot.dtype)[None, :]
-    at = jnp.concatenate([jnp.arange(3), of_landmarks.reshape(-1)])
-    rows = joint.cov[at]
+    index = jnp.concatenate([jnp.arange(3), of_landmarks.reshape(-1)])
+    rows = joint.cov[index]  # P_I
     # M, the product of the corrections so far, begins as the identity.
     local = joint._replace(
         landmarks=joint.landmarks[slot],
-        cov=jnp.concatenate([rows[:, at], jnp.eye(len(at), dtype=rows.dtype)], axis=1),
+        cov=jnp.concatenate([rows[:, index], jnp.eye(len(index), dtype=rows.dtype)], axis=1),
         alive=joint.alive[slot],
         tag=joint.tag[slot],
     )
@@ -459,33 +465,34 @@ def _correct_group(
     def correct_local(
         local: Joint, measurement: tuple[jax.Array, PyTree]
     ) -> tuple[Joint, tuple[jax.Array, jax.Array, Correction]]:
-        """The local map corrected by one measurement; reach (Z, W), L⁻¹ ν (Z,).
+        """The local map corrected by one measurement; L⁻¹ H M (Z, W), L⁻¹ ν (Z,).
 
         P of the local map and the matrix M beside it are corrected as one:
-        [P M] ← [P M] - Vᵀ [V reach].
+        [P M] ← [P M] - Vᵀ [V, L⁻¹ H M].
         """
         # One measurement as m = 1; it is of landmark i of the local map, and of slot in the map.
         i, (z, slot, matched) = jax.tree.map(lambda leaf: leaf[None], measurement)
         width = local.cov.shape[0]
         memory = joint._replace(pose=local.pose), slot
         innovation = _innovate(filter, sensor, local, i, z, matched, memory, gamma)
-        v, reach = innovation.v[:, :width], innovation.v[:, width:]
+        # Of L⁻¹ H [P M], as M is in the further columns of P.
+        v, whitened_hm = innovation.v[:, :width], innovation.v[:, width:]
         pose, landmarks = retract_map(filter.chart, local, innovation.xi[:width])
         # V has the columns of [P M], so M is corrected by the same product as P.
         cov = local.cov - linalg.gram(v, innovation.v)
         correction = jax.tree.map(lambda leaf: leaf[0], innovation.correction)
         local = local._replace(pose=pose, landmarks=landmarks, cov=cov)
-        return local, (reach, innovation.whitened, correction)
+        return local, (whitened_hm, innovation.whitened, correction)
 
     # A gradient stores the input of each step, and recomputes the rest.
     # (prevent_cse is for use outside a scan, where XLA would merge that with the original.)
-    local, (reach, whitened, corrections) = jax.lax.scan(
+    local, (whitened_hm, whitened, corrections) = jax.lax.scan(
         jax.checkpoint(correct_local, prevent_cse=False),
         local,
         (jnp.arange(len(slot)), group),
     )
     # (g·Z, D) entries, each of which P - Vᵀ V needs D times.
-    v = no_inline(linalg.matmul, reach.reshape(-1, len(at)), rows)
+    v = no_inline(linalg.matmul, whitened_hm.reshape(-1, len(index)), rows)
     landmarks = _move_map(joint, v[:, :size], whitened, filter.chart)
     cov = joint.cov - linalg.gram(v[:, :size], v)
     return joint._replace(pose=local.pose, landmarks=landmarks, cov=cov), corrections

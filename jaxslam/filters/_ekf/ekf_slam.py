@@ -52,8 +52,8 @@ from jaxslam.filters._ekf.linear_system import (
 from jaxslam.filters._ekf.predicted_measurements import prediction_of
 from jaxslam.filters._reporting import (
     NewLandmarks,
+    info_of_ignored,
     join_infos,
-    nothing_of,
     report_scan,
     with_extra,
     with_removed,
@@ -141,13 +141,14 @@ class EkfSlam(Filter):
 
     def init(self, pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"]) -> Joint:
         chart, size_l = self.chart, len(self.sensor.landmark)
-        ground = jnp.zeros((self.capacity, size_l), pose.dtype)
         if chart.basis is not None:
-            undo = linalg.inverse(chart.pose_basis(pose))
-            pose_cov = undo @ pose_cov @ undo.T
-        lin = self.linearize.init(pose, ground)
+            # E⁻¹ P E⁻ᵀ: `pose_cov` is of coordinates, P is of the errors in the chart.
+            to_errors = linalg.inverse(chart.pose_basis(pose))
+            pose_cov = to_errors @ pose_cov @ to_errors.T
+        no_landmarks = jnp.zeros((self.capacity, size_l), pose.dtype)
+        memory = self.linearize.init(pose, no_landmarks)
         joint = slots.empty(
-            pose, pose_cov, self.capacity, size_l, lin, square_root=self.square_root
+            pose, pose_cov, self.capacity, size_l, memory, square_root=self.square_root
         )
         if self.sensor.reduced is not None:
             joint = joint._replace(reduced=jnp.zeros_like(joint.alive))
@@ -176,14 +177,18 @@ def propagate(filter: EkfSlam, joint: Joint, u: Float[Array, "U"]) -> tuple[Join
     """
     chart = filter.chart
     point = LinearizationPoint(joint, chart, joint.pose, slots.robot_cov(joint, filter.square_root))
-    # (14) is the mean; f = F and noise = W Q Wᵀ are the Jacobian and the noise of (15).
-    pose, f, noise, lin = filter.linearize.motion(filter.motion, u, point)
+    # (14) is the mean; by_pose = F and noise = W Q Wᵀ are the Jacobian and the noise of (15).
+    pose, by_pose, noise, memory = filter.linearize.motion(filter.motion, u, point)
     if chart.basis is None:
-        transition = Transition(f, None, None, jnp.eye(3, dtype=noise.dtype), None)
+        # dx ← F dx + noise; the errors of the landmarks stay.
+        unit = jnp.eye(3, dtype=noise.dtype)
+        transition = Transition(
+            robot=by_pose, cross=None, landmark=None, noise=unit, cross_noise=None
+        )
     else:
         # Stored: each landmark's block of the transition needs it.
         pose = materialize(pose)
-        transition = transition_in_chart(chart, f, joint, pose)
+        transition = transition_in_chart(chart, by_pose, joint, pose)
     if filter.square_root:
         # Wide root [A X, G √N], (D, D + 3); reflections from the right make it (D, D) again.
         added = transition.lift(len(joint.cov)) @ linalg.cholesky(noise)[0]
@@ -191,15 +196,15 @@ def propagate(filter: EkfSlam, joint: Joint, u: Float[Array, "U"]) -> tuple[Join
         cov = linalg.triangular_root(root)
     elif chart.basis is None:
         # (15), (16): the three rows of the robot alone, O(N); P of the map stays as it is.
-        robot_rows = linalg.matmul(f, joint.cov[:3])
-        robot_cov = linalg.symmetrize(linalg.matmul(robot_rows[:, :3], f.T) + noise)
+        robot_rows = linalg.matmul(by_pose, joint.cov[:3])
+        robot_cov = linalg.symmetrize(linalg.matmul(robot_rows[:, :3], by_pose.T) + noise)
         # Stored separately from P, from which it is computed, so that P is written in place.
         rows = materialize(jnp.concatenate([robot_cov, robot_rows[:, 3:]], axis=1))
         # (17): the columns are the same numbers, so P stays symmetric to the bit.
         cov = jnp.asarray(joint.cov).at[:3].set(rows).at[:, :3].set(rows.T)
     else:
         cov = moved_cov(joint.cov, transition, noise)
-    return joint._replace(pose=pose, cov=cov, lin=lin), (transition,)
+    return joint._replace(pose=pose, cov=cov, lin=memory), (transition,)
 
 
 def _update(
@@ -209,8 +214,8 @@ def _update(
     infos, evicted = [], jnp.zeros_like(joint.alive)
     system: LinearSystem = ()
     for sensor, sensor_scan in filter.sensor.scans(scan):
-        if sensor is None:
-            infos.append(nothing_of(sensor_scan))
+        if sensor is None:  # of a suite: it measures other robots, as `TeamSlam` uses
+            infos.append(info_of_ignored(sensor_scan))
             continue
         joint, info, removed, sensor_system = update_by_sensor(
             filter, sensor, joint, sensor_scan, filter.births
@@ -219,6 +224,7 @@ def _update(
         evicted, system = evicted | removed, system + sensor_system
     info = join_infos(infos, scan.z.shape[1])
     if filter.sensor.reduced is not None:
+        # An inverse depth that has become certain enough is a point from now on.
         joint, is_reduced, reduction = map_coordinates.reduce_where_ready(
             joint, filter.sensor, filter.square_root
         )
@@ -242,8 +248,9 @@ def update_by_sensor(
 ) -> tuple[Joint, Info, Bool[Array, "N"], LinearSystem]:
     """The update by the scan of one sensor: associate, correct, initialize, report.
 
-    reserved: slots that no new landmark may take. Returns also the slots that were emptied to make
-    room.
+    births: `EkfSlam.births`, or 0 where this sensor starts no landmark (robots, in `TeamSlam`).
+    reserved: slots that no new landmark may take, as the poses of `TeamSlam`. Returns also the
+    slots that were emptied to make room.
     """
     # Padding may hold any number, and is multiplied by zero below.
     scan = scan._replace(z=jnp.where(scan.valid[:, None], scan.z, 0.0))
@@ -252,6 +259,7 @@ def update_by_sensor(
     )
     # -1, for no slot, becomes index 0; what is read there is masked by `matched`.
     slot = jnp.maximum(association.slot, 0)
+    # A scan without slots has no S to factor; in turn, it is a loop of no passes.
     by_scan = filter.correction == "joint" and len(scan.tag) > 0
     correct_by = correct if by_scan else correct_in_turn
     joint, correction = correct_by(filter, sensor, joint, scan.z, slot, matched)
@@ -273,16 +281,18 @@ def update_by_sensor(
 
 
 def associate_scan(
-    associate: Associate, sensor: Sensor, scan: Scan, predict: Callable[[], Prediction]
+    associate: Associate, sensor: Sensor, scan: Scan, prediction: Callable[[], Prediction]
 ) -> tuple[Association, Bool[Array, "M"]]:
     """The association of a scan, and which measurements correct the state.
 
-    Measurements of an absolute sensor have no landmark, and all valid ones correct.
+    Measurements of an absolute sensor have no landmark, and all valid ones correct; then
+    prediction() is not called.
     """
     if sensor.absolute:
         no_slot = jnp.full_like(scan.tag, -1)
         return Association(no_slot, jnp.zeros_like(scan.valid), jnp.asarray(False)), scan.valid
-    association = Association(*associate(predict(), scan))
+    # A user's method may return a plain tuple.
+    association = Association(*associate(prediction(), scan))
     matched = scan.valid & (association.slot >= 0) & ~association.is_new
     return association._replace(is_new=scan.valid & association.is_new), matched
 
@@ -305,12 +315,14 @@ def initialize(
     measured: landmarks that the scan corrected, which do not make room for new ones. Returns also
     the slots (N,) that were emptied to make room, and G_R (M, L, 3) of the new landmarks.
     """
-    none = jnp.zeros_like(is_new)
-    nothing = NewLandmarks(jnp.zeros(is_new.shape, jnp.int32), none, none, none)
-    kept = jnp.zeros_like(joint.alive)
-    no_slope = jnp.zeros((len(none), joint.landmarks.shape[1], 3), joint.pose.dtype)
+    no_measurement = jnp.zeros_like(is_new)
+    no_landmark = NewLandmarks(
+        jnp.zeros(is_new.shape, jnp.int32), no_measurement, no_measurement, no_measurement
+    )
+    none_evicted = jnp.zeros_like(joint.alive)
+    no_jacobian = jnp.zeros((len(is_new), joint.landmarks.shape[1], 3), joint.pose.dtype)
     if births == 0:
-        return joint, nothing._replace(deferred=is_new), kept, no_slope
+        return joint, no_landmark._replace(deferred=is_new), none_evicted, no_jacobian
 
     def start(joint: Joint) -> _Initialized:
         # Each measurement of `is_new` is repeated, deferred, granted, or finds the map full.
@@ -318,9 +330,9 @@ def initialize(
         wanted = is_new & ~repeated
         rank = jnp.cumsum(wanted)
         # The rank counts from 1, and is constant over the measurements that are not wanted.
-        deferred = none if births is None else wanted & (rank > births)
+        deferred = no_measurement if births is None else wanted & (rank > births)
         wanted = wanted & ~deferred
-        evicted = kept
+        evicted = none_evicted
         if filter.life is not None and filter.life.make_room is not None:
             needed = wanted.sum() - (~joint.alive).sum()
             # Not above 0 while there are free slots enough: then nothing is evicted.
@@ -332,15 +344,20 @@ def initialize(
             joint, by_pose = augment(filter, sensor, joint, scan.z, scan.tag, slot, granted)
         else:  # only as many landmarks are computed as may start
             is_kth = wanted[None, :] & (rank[None, :] == 1 + jnp.arange(births)[:, None])
-            at, has_slot = last_true_column(is_kth)
-            slot, granted = slots.allocate(occupied, has_slot)
-            joint, by_pose = augment(filter, sensor, joint, scan.z[at], scan.tag[at], slot, granted)
+            # The measurement (births,) of each birth, where there are so many.
+            source, exists = last_true_column(is_kth)
+            slot, granted = slots.allocate(occupied, exists)
+            z, tag = scan.z[source], scan.tag[source]
+            joint, by_pose = augment(filter, sensor, joint, z, tag, slot, granted)
             # Back from the births (k) to the measurements (M).
             k = jnp.clip(rank - 1, 0, births - 1)
             slot, granted, by_pose = slot[k], wanted & granted[k], by_pose[k]
         return joint, NewLandmarks(slot, granted, deferred, repeated), evicted, by_pose
 
-    return where_any(is_new.any(), start, lambda joint: (joint, nothing, kept, no_slope), joint)
+    def start_none(joint: Joint) -> _Initialized:
+        return joint, no_landmark, none_evicted, no_jacobian
+
+    return where_any(is_new.any(), start, start_none, joint)
 
 
 def augment(
@@ -373,6 +390,7 @@ def augment(
     joint = slots.scatter(
         joint, slot, granted, landmark, by_pose, landmark_covs, tag, square_root=square_root
     )
+    # max, since a measurement without a slot has index 0, which may be another's slot.
     new = jnp.zeros_like(joint.alive).at[slot].max(granted)
     return joint._replace(lin=filter.linearize.born(joint, new)), by_pose
 

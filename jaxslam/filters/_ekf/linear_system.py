@@ -158,18 +158,19 @@ def chart_jacobians(
     landmarks: Float[Array, "m L"],
     by_pose: Float[Array, "m Z 3"],
     by_landmark: Float[Array, "m Z L"],
-    moved: tuple[Float[Array, "3"], Float[Array, "m L"]] | None = None,
+    errors: tuple[Float[Array, "3"], Float[Array, "m L"]] | None = None,
 ) -> tuple[Float[Array, "m Z 3"], Float[Array, "m Z L"]]:
-    """Jacobians by errors of the chart, chained with retract(pose, l, ·) at zero or moved."""
+    """Jacobians by errors of the chart, chained with ∂retract(pose, l, ·) at zero, or at these
+    errors (dx, dl)."""
     assert chart.basis is not None
-    if moved is None:
+    if errors is None:
         basis = jax.vmap(chart.basis, in_axes=(None, 0))(pose, landmarks)
     else:
         # The basis is the derivative at zero; at ξ_i that of the new pose and then of the new
         # landmark, each by (dx, dl). The pose does not depend on dl.
         of_pose, of_landmark = jax.vmap(
             jax.jacfwd(chart.retract, argnums=(2, 3)), in_axes=(None, 0, None, 0)
-        )(pose, landmarks, *moved)
+        )(pose, landmarks, *errors)
         basis = Basis(of_pose[0], of_landmark[0], of_landmark[1])
     products = jax.vmap(linalg.matmul)
     by_chart = products(by_pose, basis.pose) + products(by_landmark, basis.cross)

@@ -16,57 +16,75 @@ from jaxslam.math._xla import materialize
 
 
 def prediction_of(filter: KalmanFilter, sensor: Sensor, joint: Joint) -> Prediction:
-    """The `Prediction` of a map; only the parts that the association calls are computed."""
-    chart, square_root = filter.chart, filter.covariance == "square_root"
-    capacity, size = joint.landmarks.shape
+    """The `Prediction` of a map; only the parts that the association calls are computed.
 
-    def jacobians() -> tuple[
-        Float[Array, "N Z"], Float[Array, "N Z 3"], Float[Array, "N Z L"], Float[Array, "N Z Z"]
-    ]:
-        """The predicted ẑ, H by errors of pose and landmark, and H P Hᵀ, for each landmark."""
-        # The blocks of P: of the robot, of it with each landmark, and of each landmark.
-        slots = jnp.arange(capacity)
-        if square_root:
-            robot, rows = joint.cov[:3], joint.cov[3:].reshape(capacity, size, -1)
-            cross = jnp.einsum("ik,nlk->nil", robot, rows)
-            robot, landmarks = robot @ robot.T, jnp.einsum("nlk,nmk->nlm", rows, rows)
-        else:
-            landmarks = joint.cov[3:, 3:].reshape(capacity, size, capacity, size)[slots, :, slots]
-            cross = joint.cov[:3, 3:].reshape(3, capacity, size).transpose(1, 0, 2)
-            robot = joint.cov[:3, :3]
-        robot, cross, landmarks = materialize((robot, cross, landmarks))
-        top = jnp.concatenate([jnp.broadcast_to(robot, (capacity, 3, 3)), cross], axis=2)
-        bottom = jnp.concatenate([cross.transpose(0, 2, 1), landmarks], axis=2)
-        local = jnp.concatenate([top, bottom], axis=1)
-        expected, by_pose, by_landmark, rest = jax.vmap(
-            lambda slot, landmark, cov: filter.linearize.observe(
-                at_slot(sensor, joint, slot),
-                LinearizationPoint(joint, chart, joint.pose, cov, slot, landmark),
-            )
-        )(slots, joint.landmarks, local)
-        if chart.basis is not None:
-            by_pose, by_landmark = chart_jacobians(
-                chart, joint.pose, joint.landmarks, by_pose, by_landmark
-            )
-        expected, by_pose, by_landmark, rest = materialize((expected, by_pose, by_landmark, rest))
-        h = jnp.concatenate([by_pose, by_landmark], axis=2)
-        hp = materialize(
-            linalg.total(h[:, :, k, None] * local[:, None, k] for k in range(3 + size))
-        )
-        alone = linalg.total(hp[:, :, None, k] * h[:, None, :, k] for k in range(3 + size))
-        return expected, by_pose, by_landmark, materialize(alone + rest)
+    As in `correction`, but of every landmark and without a measurement: ẑ_i and H_i P H_iᵀ, and for
+    joint associations H_i P H_jᵀ.
+    """
 
     def measurements() -> tuple[Float[Array, "N Z"], Float[Array, "N Z Z"]]:
-        expected, _, _, landmark = jacobians()
-        return expected, landmark
+        local_cov = _local_covs(filter, joint)
+        z_hat, by_pose, by_landmark, added_noise = _linearize_map(filter, sensor, joint, local_cov)
+        h = jnp.concatenate([by_pose, by_landmark], axis=2)
+        terms = range(h.shape[2])
+        hp = materialize(linalg.total(h[:, :, k, None] * local_cov[:, None, k] for k in terms))
+        hph = linalg.total(hp[:, :, None, k] * h[:, None, :, k] for k in terms)
+        # R(ẑ) follows in `prediction_from`; the linearizer's share is added here.
+        return z_hat, materialize(hph + added_noise)
 
     def cross() -> Float[Array, "N Z N Z"]:
-        _, by_pose, by_landmark, _ = jacobians()
-        cov = joint.cov @ joint.cov.T if square_root else joint.cov
-        rows = cov[3:].reshape(capacity, size, cov.shape[1])
+        local_cov = _local_covs(filter, joint)
+        _, by_pose, by_landmark, _ = _linearize_map(filter, sensor, joint, local_cov)
+        capacity, size_l = joint.landmarks.shape
+        is_root = filter.covariance == "square_root"
+        cov = joint.cov @ joint.cov.T if is_root else joint.cov
+        rows = cov[3:].reshape(capacity, size_l, cov.shape[1])
         hp = linalg.total(by_pose[:, :, k, None] * cov[None, None, k] for k in range(3))
-        for k in range(size):
+        for k in range(size_l):
             hp = hp + by_landmark[:, :, k, None] * rows[:, None, k]
         return projected_cov(hp, by_pose, by_landmark, jnp.arange(capacity), capacity)
 
     return prediction_from(sensor, joint.tag, joint.alive, measurements, cross)
+
+
+def _local_covs(filter: KalmanFilter, joint: Joint) -> Float[Array, "N K K"]:
+    """P of the robot and each landmark, K = 3 + L: `slots.local_cov` of all slots in one pass."""
+    capacity, size_l = joint.landmarks.shape
+    if filter.covariance == "square_root":
+        robot_rows, rows = joint.cov[:3], joint.cov[3:].reshape(capacity, size_l, -1)
+        cross = jnp.einsum("ik,nlk->nil", robot_rows, rows)
+        robot, landmarks = robot_rows @ robot_rows.T, jnp.einsum("nlk,nmk->nlm", rows, rows)
+    else:
+        slot = jnp.arange(capacity)
+        # P of landmarks by slot and entry, (N, L, N, L): its diagonal blocks.
+        landmarks = joint.cov[3:, 3:].reshape(capacity, size_l, capacity, size_l)[slot, :, slot]
+        cross = joint.cov[:3, 3:].reshape(3, capacity, size_l).transpose(1, 0, 2)
+        robot = joint.cov[:3, :3]
+    robot, cross, landmarks = materialize((robot, cross, landmarks))
+    top = jnp.concatenate([jnp.broadcast_to(robot, (capacity, 3, 3)), cross], axis=2)
+    bottom = jnp.concatenate([cross.transpose(0, 2, 1), landmarks], axis=2)
+    return jnp.concatenate([top, bottom], axis=1)
+
+
+def _linearize_map(
+    filter: KalmanFilter, sensor: Sensor, joint: Joint, local_cov: Float[Array, "N K K"]
+) -> tuple[
+    Float[Array, "N Z"], Float[Array, "N Z 3"], Float[Array, "N Z L"], Float[Array, "N Z Z"]
+]:
+    """The predicted ẑ of each landmark, H by errors of pose and landmark, and the covariance that
+    the linearizer adds to R."""
+    chart = filter.chart
+    z_hat, by_pose, by_landmark, added_noise = jax.vmap(
+        lambda slot, landmark, cov: filter.linearize.observe(
+            at_slot(sensor, joint, slot),
+            LinearizationPoint(joint, chart, joint.pose, cov, slot, landmark),
+        )
+    )(jnp.arange(len(joint.landmarks)), joint.landmarks, local_cov)
+    if chart.basis is not None:
+        by_pose, by_landmark = chart_jacobians(
+            chart, joint.pose, joint.landmarks, by_pose, by_landmark
+        )
+    linearized: tuple[Array, Array, Array, Array] = materialize(
+        (z_hat, by_pose, by_landmark, added_noise)
+    )
+    return linearized

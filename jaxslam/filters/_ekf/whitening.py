@@ -82,11 +82,11 @@ def factor_of(
     inverse, definite: L_ii⁻¹ of each S_ii alone, and whether S_ii is positive definite.
     """
     m, size_z = s.shape[:2]
-    same = jnp.eye(m, dtype=s.dtype)[:, None, :, None]  # (m, 1, m, 1)
+    diagonal = jnp.eye(m, dtype=s.dtype)[:, None, :, None]  # (m, 1, m, 1)
     both = fuse[:, None, None, None] & fuse[None, None, :, None]
     # The identity where not fused, apart from all others: then S is regular if its fused part is.
     unit = jnp.eye(size_z, dtype=s.dtype)
-    s = materialize(jnp.where(both, s, same * unit[None, :, None]))
+    s = materialize(jnp.where(both, s, diagonal * unit[None, :, None]))
     # (m, Z, m, Z) -> (K, K): row i·Z + j is entry j of measurement i.
     factor = materialize(linalg.cholesky(s.reshape(m * size_z, m * size_z))[0])
     pivots = jnp.diagonal(factor).reshape(m, size_z)

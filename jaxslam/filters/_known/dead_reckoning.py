@@ -13,7 +13,7 @@ from jaxslam.core.types import Estimate, Info, Scan
 from jaxslam.core.validation import instance_of
 from jaxslam.filters._ekf.checks import check_fit
 from jaxslam.filters._ekf.ekf_slam import EkfSlam
-from jaxslam.filters._reporting import nothing_of
+from jaxslam.filters._reporting import info_of_ignored
 from jaxslam.linearize._first_order import AtEstimate
 
 
@@ -42,7 +42,7 @@ class DeadReckoning(Filter):
         return self._ekf.predict(state, u, key)
 
     def update(self, state: Joint, scan: Scan, key: Array) -> tuple[Joint, Info]:
-        return state, nothing_of(scan)
+        return state, info_of_ignored(scan)
 
     def estimate(self, state: Joint) -> Estimate:
         return self._ekf.estimate(state)

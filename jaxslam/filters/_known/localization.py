@@ -47,7 +47,7 @@ from jaxslam.filters._ekf.correction import (
 from jaxslam.filters._ekf.ekf_slam import associate_scan
 from jaxslam.filters._gaussian_correction import correct_gaussian
 from jaxslam.filters._known_map import hold_map, map_tags
-from jaxslam.filters._reporting import join_infos, nothing_of, report_scan
+from jaxslam.filters._reporting import info_of_ignored, join_infos, report_scan
 from jaxslam.linearize._first_order import AtEstimate, predicted_noise
 from jaxslam.math import _linalg as linalg
 from jaxslam.math._arrays import Number
@@ -132,7 +132,7 @@ class Localization(Filter):
         infos = []
         for sensor, part in self.sensor.scans(scan):
             if sensor is None:
-                infos.append(nothing_of(part))
+                infos.append(info_of_ignored(part))
                 continue
             # Padding may hold any number, and is multiplied by zero below.
             part = part._replace(z=jnp.where(part.valid[:, None], part.z, 0.0))
@@ -177,14 +177,14 @@ def _predict_map(filter: Localization, sensor: Sensor, state: Joint) -> Predicti
 
     def linearize() -> tuple[Float[Array, "N Z"], Float[Array, "N Z 3"], Float[Array, "N Z Z"]]:
         every_slot = jnp.arange(len(state.tag))
-        z_hat, h, rest = _linearize(filter, sensor, state, every_slot, state.pose)
+        z_hat, h, added_noise = _linearize(filter, sensor, state, every_slot, state.pose)
         if filter.chart.basis is not None:
             h = h @ filter.chart.pose_basis(state.pose)
-        return z_hat, h, rest
+        return z_hat, h, added_noise
 
     def measurements() -> tuple[Float[Array, "N Z"], Float[Array, "N Z Z"]]:
-        z_hat, h, rest = linearize()
-        return z_hat, linalg.symmetrize(h @ state.cov @ h.transpose(0, 2, 1)) + rest
+        z_hat, h, added_noise = linearize()
+        return z_hat, linalg.symmetrize(h @ state.cov @ h.transpose(0, 2, 1)) + added_noise
 
     def cross() -> Float[Array, "N Z N Z"]:
         h = linearize()[1]
@@ -201,14 +201,14 @@ def _linearize(
     pose: Float[Array, "3"],
 ) -> tuple[Float[Array, "m Z"], Float[Array, "m Z 3"], Float[Array, "m Z Z"]]:
     """The predicted measurements of landmarks (m,) from a pose, H by its coordinates, and the
-    linearizer's addition to R."""
+    covariance that the linearizer adds to R."""
 
     def observe(
         slot: Int[Array, ""], landmark: Float[Array, "L"]
     ) -> tuple[Float[Array, "Z"], Float[Array, "Z 3"], Float[Array, "Z Z"]]:
         point = LinearizationPoint(state, filter.chart, pose, state.cov, slot, landmark)
-        z_hat, by_pose, _, rest = filter.linearize.observe(sensor, point)
-        return z_hat, by_pose, rest
+        z_hat, by_pose, _, added_noise = filter.linearize.observe(sensor, point)
+        return z_hat, by_pose, added_noise
 
     return jax.vmap(observe)(slot, state.landmarks[slot])
 
@@ -229,12 +229,12 @@ def _correct(
     chart, (m, size_z) = filter.chart, z.shape
     pose, xi = state.pose, jnp.zeros_like(state.pose)
     for i in range(filter.iterations):
-        z_hat, h, rest = _linearize(filter, sensor, state, slot, pose)
+        z_hat, h, added_noise = _linearize(filter, sensor, state, slot, pose)
         nu, jacobian = jax.vmap(sensor.residual)(z, z_hat), h
         if chart.basis is not None:
             h = h @ jax.jacfwd(chart.retract_pose, argnums=1)(state.pose, xi)
         if i == 0:
-            noise = jax.vmap(partial(predicted_noise, sensor))(z_hat, z, matched) + rest
+            noise = jax.vmap(partial(predicted_noise, sensor))(z_hat, z, matched) + added_noise
             s_ii = linalg.symmetrize(h @ state.cov @ h.transpose(0, 2, 1) + noise)
             alone = jax.vmap(gaussian_terms)(nu, s_ii)
             prior = Correction(

@@ -12,6 +12,7 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
+from jaxslam.core._validation import is_user_file
 from jaxslam.core.protocols import Chart, Filter, Linearizer, Motion, Sensor
 from jaxslam.graphs import Factor
 from jaxslam.laser.grids.beam_models import BeamModel
@@ -19,7 +20,7 @@ from jaxslam.simulation._worlds import World
 from jaxslam.verify import Check, Report
 from jaxslam.verify._examination import Model
 from jaxslam.verify._inputs.functions import Claim, makes_a_model
-from jaxslam.verify._user_errors import describe_error, is_user_file, place_of_error
+from jaxslam.verify._user_errors import describe_error, place_of_error
 from jaxslam.verify._verifier import build
 
 _CLAIMS = ("_jacobian", "_jacobians")

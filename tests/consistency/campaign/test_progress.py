@@ -75,10 +75,10 @@ class Begun(Exception):
 def test_a_campaign_has_a_bar_by_default_where_it_can_be_seen(capsys, monkeypatch, terminal):
     bars = []
 
-    def begun(self, plan, todo):
-        bars.append(self.progress)
-        if self.progress is not None:
-            self.progress(3, 10)
+    def begun(self, plan, todo, report):
+        bars.append(report)
+        if report is not None:
+            report(3, 10)
         raise Begun
 
     monkeypatch.setattr(_work.Work, "compute", begun)

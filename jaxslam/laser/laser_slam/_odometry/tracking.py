@@ -185,7 +185,20 @@ def match_to_keyframes(
         keyframes=first,
         reference=_reference_of(first, scans, settings),
     )
-    rows = [Row(zero, 0, zero, no_cov, no_cov, True, False, False, 0.0, 0.0, False)]
+    start = Row(
+        poses=zero,
+        base=0,
+        z=zero,
+        cov=no_cov,
+        cov_if_right=no_cov,
+        keyframe=True,
+        matched=False,
+        doubted=False,
+        inliers=0.0,
+        residual=0.0,
+        refuted=False,
+    )
+    rows = [start]
     for scan in range(1, len(scans.usable)):
         track, row = step(track, scan, scans, steps, settings)
         rows.append(row)
@@ -255,9 +268,14 @@ def step(
         residual=fit.residual,
         refuted=fit.refutes_raw,
     )
-    alternative = _alternative_of(track, begin, raw, fit)
-    after = Track(
-        mode, at, doubt, motion, missed, before_lag, alternative, track.keyframes, track.reference
+    after = track._replace(
+        mode=mode,
+        at=at,
+        doubt=doubt,
+        motion=motion,
+        missed=missed,
+        before_lag=before_lag,
+        alternative=_alternative_of(track, begin, raw, fit),
     )
 
     # Make a keyframe. Where odometry is frozen the robot is soon farther off than is searched.
@@ -500,35 +518,41 @@ def place_unmatched(odometry: Odometry, scans: Scans, steps: Steps, settings: Se
     for scan in np.flatnonzero(~placed & scans.usable):
         if not placed[scan:].any():
             continue  # nothing after it
-        # The nearest scans with a place on both sides: `argmax` is the first True.
+
+        # Guess: on the way between the nearest scans with a place. `argmax` is the first True.
         before = scan - 1 - int(np.argmax(placed[:scan][::-1]))
         after = scan + int(np.argmax(placed[scan:]))
         way = poses.between(path[before], path[after])
         middle = poses.compose(path[before], (scan - before) / (after - before) * way)
-        # keys[row - 1] is the last keyframe before the scan.
-        row, half = int(np.searchsorted(keys, scan)), settings.reference // 2
-        base = keys[row - 1]
-        around = keys[max(row - half, 0) : row + half]
+        prior_cov = steps.cov[scan] + reach_cov(np.array([np.hypot(way[0], way[1]), abs(way[2])]))
+
+        # Reference: half of its keyframes before the scan, half after it.
+        next_key, half = int(np.searchsorted(keys, scan)), settings.reference // 2
+        base = keys[next_key - 1]
+        around = keys[max(next_key - half, 0) : next_key + half]
         around = around[scans.usable[around]]
         if not len(around):
             continue
         reference = reference_of(
             scans, around, path[around], path[base], settings.scans_of_reference
         )
+
+        # Match, and judge.
         guess = poses.between(path[base], middle)
-        prior = steps.cov[scan] + reach_cov(np.array([np.hypot(way[0], way[1]), abs(way[2])]))
         points = rows_of(scans.points, scan)
-        fit = match(FAR, reference, points, guess, prior, NO_FLOOR, settings)
+        fit = match(FAR, reference, points, guess, prior_cov, NO_FLOOR, settings)
         if fit.inliers < _LATER_INLIERS or fit.through > _MAX_THROUGH or fit.ambiguous:
             continue
         by_raw = RelativeEstimate(odometry.z[scan].copy(), odometry.cov[scan].copy())
         contradicted = _contradicts(fit.pose, by_raw)
         if contradicted and not _is_sure(fit):
             continue
-        odometry.matched[scan], odometry.doubted[scan] = True, contradicted
-        odometry.inliers[scan], odometry.residual[scan] = fit.inliers, fit.residual
+
+        # Place. The scan is no neighbour of later ones: `placed` stays.
+        path[scan] = poses.compose(path[base], fit.pose)
         odometry.z[scan] = fit.pose
         odometry.cov[scan] = odometry.cov_if_right[scan] = fit.cov
         if contradicted:
             odometry.cov[scan] += _doubt_cov(by_raw.cov, poses.between(fit.pose, by_raw.pose))
-        path[scan] = poses.compose(path[base], fit.pose)
+        odometry.matched[scan], odometry.doubted[scan] = True, contradicted
+        odometry.inliers[scan], odometry.residual[scan] = fit.inliers, fit.residual
