@@ -332,7 +332,7 @@ COV = np.tile(np.eye(3), (20, 1, 1))
         (TIME, PATH, COV[:, :2]),
         (TIME, PATH),
         {},
-        r"estimate: expected covariances of shape \(20, 3, 3\)",
+        r"estimate: covariances: expected shape \(20, 3, 3\)",
     ),
     ((TIME, PATH, COV), (TIME, PATH * np.nan), {}, "truth: expected finite times and poses, row 0"),
     (
@@ -345,19 +345,19 @@ COV = np.tile(np.eye(3), (20, 1, 1))
         (TIME, PATH, COV),
         (TIME, PATH),
         {"align": "worst"},
-        "align: expected one of none, first, best",
+        'align: expected "none" or "first" or "best"',
     ),
     (
         (TIME, PATH, COV),
         (TIME, PATH),
         {"covariance_frame": "map"},
-        "covariance_frame: expected one",
+        'covariance_frame: expected "world" or "body"',
     ),
     (
         (TIME, PATH, COV),
         (TIME, PATH),
         {"longest_gap": 0.0},
-        "longest_gap: expected seconds above 0",
+        "longest_gap: expected a number above 0",
     ),
     told="judge_recording: ",
 )

@@ -32,7 +32,7 @@ from jaxslam.consistency.campaign._run_estimates import (
     score_estimates,
     shape_of,
 )
-from jaxslam.consistency.campaign._work import Work, show_progress
+from jaxslam.consistency.campaign._work import Work, progress_report
 from jaxslam.core._numbers import is_concrete
 from jaxslam.core._reprs import describe
 from jaxslam.core.protocols import Candidate
@@ -176,9 +176,10 @@ def judge_sources(
         pieces = missing_pieces([], runs, plan.wide)
         judged = _judge_pieces(plan, sources, pieces, origin, progress)
         # The filters, and with them the limit of accuracy, which needs the world alone.
-        work = Work(2, None, progress or None, {n: Tally() for n in (*filters, BOUND)})
-        with show_progress(work, plan, progress is None and bool(filters)):
-            work.compute(plan, pieces)
+        work = Work(2, None, {name: Tally() for name in (*filters, BOUND)})
+        shown = progress if filters or progress is not None else False
+        with progress_report(shown, plan) as report:
+            work.compute(plan, pieces, report)
         limit = float(work.tallies[BOUND].first("limit"))
         tallies = {name: Tally() for name in sources} | work.tallies
         for name, estimator in judged.items():
