@@ -65,6 +65,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--every",
+        dest="stride",
         type=int,
         default=1,
         metavar="K",
@@ -115,16 +116,20 @@ def _judge_estimates(options: argparse.Namespace, command: str) -> int:
     folders = _named([Path(folder) for folder in options.estimates])
     draws = read_draws(Path(options.draws))
     runs = draws.runs if options.runs is None else options.runs
-    for name in ("runs", "every", "processes"):
-        require(f"--{name}", getattr(options, name), or_none(at_least(1)))
+    for name, count in (
+        ("runs", options.runs),
+        ("every", options.stride),
+        ("processes", options.processes),
+    ):
+        require(f"--{name}", count, or_none(at_least(1)))
     if runs > draws.runs:
         raise ValueError(f"--runs: expected at most {draws.runs}, as {options.draws} has")
     require("--time-limit", options.time_limit, or_none(positive))
     user = UserObjects()
     world = user.scenario(draws.scenario, draws.steps)
-    if world.steps % options.every:
+    if world.steps % options.stride:
         raise ValueError(
-            f"--every: expected a divisor of the {world.steps} steps, got {options.every}"
+            f"--every: expected a divisor of the {world.steps} steps, got {options.stride}"
         )
     filters = user.filters(options.filters, world) if options.filters.strip() else {}
     if twice := [name for name in folders if name in filters]:
@@ -147,14 +152,14 @@ def _judge_estimates(options: argparse.Namespace, command: str) -> int:
             world,
             {
                 name: folder_source(
-                    folder, draws, world.sensor.measurements, options.every, failures
+                    folder, draws, world.sensor.measurements, options.stride, failures
                 )
                 for name, folder in folders.items()
             },
             runs,
             draws.key,
             filters=filters,
-            stride=options.every,
+            stride=options.stride,
             bound=options.bound,
             devices=devices,
         )

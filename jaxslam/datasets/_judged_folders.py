@@ -28,7 +28,7 @@ from jaxslam.consistency.campaign._run_estimates import (
 )
 from jaxslam.core.logs._tables import POSE, TAG, TIME, split_unit
 from jaxslam.core.types import Log, Truth
-from jaxslam.core.validation import InvalidFile
+from jaxslam.core.validation import InvalidFile, refusals_of
 from jaxslam.datasets._landmark_logs.table_reader import MEASUREMENTS, ODOMETRY, CsvTable
 from jaxslam.datasets._landmark_logs.table_reader import MISSING as NO_NUMBER
 from jaxslam.datasets._lines import read_bytes, stored_file
@@ -236,7 +236,8 @@ def read_estimate(
         innovations = _read_innovations(_Table(folder / INNOVATIONS), truth, size)
         if isinstance(innovations, RunFault):
             return innovations
-    return as_estimate(str(folder), RunEstimate(poses, covs, maps, innovations))
+    with refusals_of(str(folder)):
+        return as_estimate(RunEstimate(poses, covs, maps, innovations))
 
 
 def _read_map(path: "_Table", truth: TruthOfRun) -> tuple[np.ndarray, ...]:

@@ -27,9 +27,9 @@ from jaxslam.consistency.campaign._run_estimates import (
     RunEstimate,
     RunFault,
     as_estimate,
-    checked,
     estimate_of_run,
     score_estimates,
+    select_rows,
     shape_of,
 )
 from jaxslam.consistency.campaign._work import Work, progress_report
@@ -134,7 +134,8 @@ def judge_estimator(
             text = "".join(traceback.format_exception(error)).rstrip()
             return Outcome(truth, None, RunFault(reason, first_line, text))
         seconds = time.perf_counter() - began
-        estimate = as_estimate(f"judge_estimator: {name}, run {number}", value)
+        with refusals_of(f"judge_estimator: {name}, run {number}"):
+            estimate = as_estimate(value)
         return Outcome(truth, estimate, None, seconds)
 
     return judge_sources(
@@ -295,9 +296,8 @@ def _judge_pieces(
                     outcome = source(first + i, truth, copied)
                     estimate, fault = outcome.estimate, outcome.fault
                     if estimate is not None and fault is None:
-                        estimate, fault = checked(
-                            f"{name}, run {first + i}", estimate, outcome.truth, shape
-                        )
+                        with refusals_of(f"{name}, run {first + i}"):
+                            estimate, fault = select_rows(estimate, outcome.truth, shape)
                         outcome = outcome._replace(
                             estimate=None if fault else estimate, fault=fault
                         )

@@ -20,6 +20,7 @@ from jaxslam.consistency.campaign._block_programs import statistics_program
 from jaxslam.core._units import TURN
 from jaxslam.core.protocols import Sensor
 from jaxslam.core.types import Estimate, Info, Log, Status, Trace, Truth
+from jaxslam.core.validation import InvalidField
 
 MISSING, EARLY, GAPS = "missing", "ends early", "has no estimate at some steps"
 NOT_FINITE = "not finite"
@@ -80,10 +81,10 @@ class RunFault(NamedTuple):
     """a traceback, or what a program wrote to its standard error; "" without one"""
 
 
-def as_estimate(name: str, value: object) -> RunEstimate:
+def as_estimate(value: object) -> RunEstimate:
     """A tuple (poses, covs), or an object with these and perhaps maps and innovations, as arrays.
 
-    Raises ValueError, which begins with a name, on anything else.
+    Raises InvalidField on anything else.
     """
     if hasattr(value, "poses") and hasattr(value, "covs"):
         fields = value.poses, value.covs, getattr(value, "maps", None)
@@ -91,39 +92,38 @@ def as_estimate(name: str, value: object) -> RunEstimate:
     elif isinstance(value, tuple) and len(value) == 2:
         fields, innovations = (*value, None), None
     else:
-        raise ValueError(
-            f"{name}: expected (poses, covs), or an object that has these and perhaps maps and "
-            f"innovations, got {type(value).__name__}"
+        raise InvalidField(
+            "",
+            "expected (poses, covs), or an object that has these and perhaps maps and innovations, "
+            f"got {type(value).__name__}",
         )
     maps = fields[2]
-    poses = _array(f"{name}: poses", fields[0], ("K", 3))
-    covs = _array(f"{name}: covs", fields[1], (len(poses), 3, 3))
+    poses = _array("poses", fields[0], ("K", 3))
+    covs = _array("covs", fields[1], (len(poses), 3, 3))
     if maps is not None:
-        means, map_covs, tags = _parts(f"{name}: maps", maps, ("means", "covs", "tags"))
+        means, map_covs, tags = _parts("maps", maps, ("means", "covs", "tags"))
         lead = (len(poses),) if np.ndim(tags) == 2 else ()
-        tags = _array(f"{name}: tags of maps", tags, (*lead, "N"))
+        tags = _array("tags of maps", tags, (*lead, "N"))
         count = tags.shape[-1]
-        means = _array(f"{name}: means of maps", means, (*lead, count, 2))
-        maps = means, _array(f"{name}: covs of maps", map_covs, (*lead, count, 2, 2)), _whole(tags)
+        means = _array("means of maps", means, (*lead, count, 2))
+        maps = means, _array("covs of maps", map_covs, (*lead, count, 2, 2)), _whole(tags)
     if innovations is not None:
         fields_of = Innovations._fields
         count = len(innovations) if isinstance(innovations, tuple | list) else 0
-        parts = _parts(f"{name}: innovations", innovations, fields_of[: min(max(count, 4), 7)])
-        rows = _array(f"{name}: rows of innovations", parts[0], ("J",))
-        nu = _array(f"{name}: ν of innovations", parts[2], (len(rows), "Z"))
+        parts = _parts("innovations", innovations, fields_of[: min(max(count, 4), 7)])
+        rows = _array("rows of innovations", parts[0], ("J",))
+        nu = _array("ν of innovations", parts[2], (len(rows), "Z"))
         rejected, nis, log_likelihood = (
-            None
-            if value is None
-            else _array(f"{name}: {field} of innovations", value, (len(rows),))
+            None if value is None else _array(f"{field} of innovations", value, (len(rows),))
             for field, value in zip(
                 fields_of[4:], (*parts[4:], *[None] * (7 - len(parts))), strict=True
             )
         )
         innovations = Innovations(
             _whole(rows),
-            _whole(_array(f"{name}: tags of innovations", parts[1], (len(rows),))),
+            _whole(_array("tags of innovations", parts[1], (len(rows),))),
             nu,
-            _array(f"{name}: S of innovations", parts[3], (len(rows), *[nu.shape[1]] * 2)),
+            _array("S of innovations", parts[3], (len(rows), *[nu.shape[1]] * 2)),
             np.zeros(len(rows), bool) if rejected is None else rejected > 0,
             nis,
             log_likelihood,
@@ -131,23 +131,23 @@ def as_estimate(name: str, value: object) -> RunEstimate:
     return RunEstimate(poses, covs, maps, innovations)
 
 
-def _array(name: str, value: object, shape: tuple[int | str, ...]) -> np.ndarray:
+def _array(field: str, value: object, shape: tuple[int | str, ...]) -> np.ndarray:
     """An array of this shape, in which a letter is any number, in float64."""
     try:
         array = np.asarray(value, np.float64)
     except (TypeError, ValueError):
-        raise ValueError(f"{name}: expected real numbers, got {value!r:.60}") from None
+        raise InvalidField(field, f"expected real numbers, got {value!r:.60}") from None
     if array.ndim != len(shape) or any(
         isinstance(n, int) and n != m for n, m in zip(shape, array.shape, strict=True)
     ):
         expected = ", ".join(map(str, shape)) + "," * (len(shape) == 1)
-        raise ValueError(f"{name}: expected shape ({expected}), got {array.shape}")
+        raise InvalidField(field, f"expected shape ({expected}), got {array.shape}")
     return array
 
 
-def _parts(name: str, value: Any, parts: tuple[str, ...]) -> tuple[Any, ...]:
+def _parts(field: str, value: Any, parts: tuple[str, ...]) -> tuple[Any, ...]:
     if not isinstance(value, tuple | list) or len(value) != len(parts):
-        raise ValueError(f"{name}: expected ({', '.join(parts)}), got {type(value).__name__}")
+        raise InvalidField(field, f"expected ({', '.join(parts)}), got {type(value).__name__}")
     return tuple(value)
 
 
@@ -176,13 +176,13 @@ def shape_of(log: Log, truth: Truth, stride: int) -> RunShape:
     return RunShape(steps, places, size, len(truth.landmarks), stride)
 
 
-def checked(
-    name: str, estimate: RunEstimate, truth: Truth, shape: RunShape
+def select_rows(
+    estimate: RunEstimate, truth: Truth, shape: RunShape
 ) -> tuple[RunEstimate, RunFault | None]:
     """An estimate with the rows that are judged alone, and what is wrong with the run, if anything.
 
-    Raises ValueError, which begins with a name, on more rows than steps, on a step or a tag that
-    the run does not have, and on a landmark twice in a map.
+    Raises InvalidField on more rows than steps, on a step or a tag that the run does not have, and
+    on a landmark twice in a map.
     """
     steps, stride = shape.steps, shape.stride
     rows, expected = len(estimate.poses), steps // stride
@@ -194,10 +194,10 @@ def checked(
         estimate = estimate._replace(poses=estimate.poses[at], covs=estimate.covs[at], maps=maps)
     elif rows > expected:
         counts = f"{steps}" if stride == 1 else f"{steps} or {expected}"
-        raise ValueError(f"{name}: poses: expected {counts} rows, got {rows}")
+        raise InvalidField("poses", f"expected {counts} rows, got {rows}")
     if rows < expected:
         return estimate, RunFault(EARLY, f"{rows} of {expected} rows")
-    _check_identities(name, estimate, shape)
+    _check_identities(estimate, shape)
     for part, values in (
         ("poses", estimate.poses),
         ("covs", estimate.covs),
@@ -233,39 +233,39 @@ def _is_in_degrees(heading: np.ndarray, true_heading: np.ndarray) -> bool:
     return in_radians > 0.5 and misfit(np.deg2rad(heading)) < in_radians / 4
 
 
-def _check_identities(name: str, estimate: RunEstimate, shape: RunShape) -> None:
-    """Raise ValueError on a tag or a step that the run does not have."""
+def _check_identities(estimate: RunEstimate, shape: RunShape) -> None:
+    """Raise InvalidField on a tag or a step that the run does not have."""
     if estimate.maps is not None:
         tags = np.atleast_2d(estimate.maps[2])
-        _check_range(f"{name}: maps: tags", tags, -1, shape.landmarks)
+        _check_range("maps: tags", tags, -1, shape.landmarks)
         for row in tags:
             present = row[row >= 0]
             if len(np.unique(present)) < len(present):
                 twice = next(int(tag) for tag in present if (present == tag).sum() > 1)
-                raise ValueError(f"{name}: maps: expected each tag once, got {twice} twice")
+                raise InvalidField("maps", f"expected each tag once, got {twice} twice")
     if estimate.innovations is not None:
         rows, tags, nu, *_ = estimate.innovations
-        _check_range(f"{name}: innovations: rows", rows, 0, shape.steps)
-        _check_range(f"{name}: innovations: tags", tags, -1, shape.landmarks)
+        _check_range("innovations: rows", rows, 0, shape.steps)
+        _check_range("innovations: tags", tags, -1, shape.landmarks)
         if len(rows) and nu.shape[1] != shape.size:
-            raise ValueError(
-                f"{name}: innovations: expected ν of {shape.size} numbers, as a measurement has, "
-                f"got {nu.shape[1]}"
+            raise InvalidField(
+                "innovations",
+                f"expected ν of {shape.size} numbers, as a measurement has, got {nu.shape[1]}",
             )
         most = int(np.bincount(rows).max(initial=0))
         if most > shape.places:
-            raise ValueError(
-                f"{name}: innovations: expected at most {shape.places} at a step, as many as its "
-                f"measurements, got {most} at step {int(np.bincount(rows).argmax())}"
+            raise InvalidField(
+                "innovations",
+                f"expected at most {shape.places} at a step, as many as its measurements, got "
+                f"{most} at step {int(np.bincount(rows).argmax())}",
             )
 
 
-def _check_range(name: str, values: np.ndarray, least: int, end: int) -> None:
+def _check_range(field: str, values: np.ndarray, least: int, end: int) -> None:
     outside = values[(values < least) | (values >= end)]
     if outside.size:
-        raise ValueError(
-            f"{name}: expected whole numbers from {least} to {end - 1}, got {int(outside[0])}"
-        )
+        reason = f"expected whole numbers from {least} to {end - 1}, got {int(outside[0])}"
+        raise InvalidField(field, reason)
 
 
 def trace_of(estimate: RunEstimate | None, shape: RunShape) -> tuple[Estimate, Info]:
