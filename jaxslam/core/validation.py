@@ -8,8 +8,6 @@ check takes the name of its caller. What JAX traces is checked for its shape and
 
     with refusals_of("simulate"):
         require("scenario", scenario, instance_of(World))
-        if late:
-            raise InvalidField("start", "expected …, got …")
 """
 
 import math
