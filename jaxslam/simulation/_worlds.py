@@ -276,6 +276,20 @@ def _draw_run(scenario: World, key: Array, number: int) -> tuple[Truth, Log]:
     return scenario.run(key, number)
 
 
+def run_count(world: World) -> Check:
+    """The check of a number of runs: an integer >= 1, at most as many as a world has recorded."""
+
+    def check(value: Any) -> int:
+        runs = int(at_least(1)(value))
+        if (most := world.recorded_runs) is not None and runs > most:
+            raise ValueError(
+                f"expected at most {most}, the recorded runs of {world.name}, got {runs}"
+            )
+        return runs
+
+    return check
+
+
 BLOCK = 16
 """Number of runs of a campaign that a CPU draws together. The same number of a run has the same
 bits at the same place in a block of the same size."""

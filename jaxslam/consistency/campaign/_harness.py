@@ -50,7 +50,7 @@ from jaxslam.core.validation import (
     require,
 )
 from jaxslam.graphs.smoothing._forward_pass import LogEstimator
-from jaxslam.simulation._worlds import World, with_positions
+from jaxslam.simulation._worlds import World, run_count, with_positions
 
 _T = TypeVar("_T")
 
@@ -193,14 +193,11 @@ def _check(
     executor: object,
 ) -> None:
     """Raise InvalidField on arguments that `monte_carlo` does not take."""
-    require("runs", runs, at_least(1))
     require("block", block, or_none(at_least(1)))
     require("workers", workers, or_none(at_least(1)))
     require("part", part, or_none(one_part))
     require("scenario", scenario, instance_of(World))
-    if (most := scenario.recorded_runs) is not None and runs > most:
-        reason = f"expected at most {most}, the recorded runs of {scenario.name}, got {runs}"
-        raise InvalidField("runs", reason)
+    require("runs", runs, run_count(scenario))
     require("key", key, prng_key)
     if not isinstance(filters, Mapping) or not filters:
         got = "none" if isinstance(filters, Mapping) else describe(filters)
