@@ -106,7 +106,7 @@ class RecordedErrors(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class RecordingScores:
-    """What a recording says of the covariance of its poses; prints as a table.
+    """NEES, coverage, factors of σ and clock lag of a recording; prints as a table.
 
     Intervals have the level 95 %. What needs a covariance is empty if there is none.
     """
@@ -183,7 +183,7 @@ def judge_recording(
     covariance_frame: str = "world",
     longest_gap: float | None = None,
 ) -> RecordingScores:
-    """The errors of recorded poses, held against the covariances that were claimed with them.
+    """The scores of recorded poses: errors, compared with the covariances that were claimed.
 
     With the estimate (x̂, ŷ, θ̂) at a time, its claimed covariance P and the truth (x, y, θ),
     interpolated on SE(2), the error is e = (R(θ̂)ᵀ (p - p̂), θ - θ̂): along, across, heading. Its

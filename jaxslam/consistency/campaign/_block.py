@@ -213,7 +213,7 @@ class BlockRunner:
             chart_error = np.swapaxes(jax.device_get(results.chart_error), 0, 1)
             by_run: PyTree = _on_host(results), truth, statistics, chart_error, measured
             by_run = jax.tree.map(lambda leaf: leaf[wanted], by_run)
-            score_of_runs = score(*thinned(plan.stride, *by_run))
+            score_of_runs = score(*select_steps(plan.stride, *by_run))
             scores[name] = condense(score_of_runs, first, float(self._limit))
         scores[BOUND] = {"limit": self._limit}
         if plan.bound:
@@ -224,7 +224,7 @@ class BlockRunner:
         return BlockResult(scores, run_0, seconds, self.compile_seconds)
 
 
-def thinned(
+def select_steps(
     stride: int,
     trace: Trace,
     truth: Truth,

@@ -170,7 +170,7 @@ def monte_carlo(
         campaign = None
         if tallies[BOUND].pieces():
             seconds = time.perf_counter() - began
-            campaign = summed_up(plan, tallies, work, origin, seconds, compare=stop is None)
+            campaign = sum_up(plan, tallies, work, origin, seconds, compare=stop is None)
         if isinstance(stop, Incomplete):
             done = f"{campaign.runs if campaign else 0} of {runs} runs done"
             raise Incomplete(f"monte_carlo: executor: {stop}; {done}", campaign) from stop.__cause__
@@ -239,7 +239,7 @@ def summaries_of(tallies: dict[str, Tally]) -> tuple[int, np.ndarray, dict[str, 
     return finished, tallies[BOUND].first("limit"), summaries
 
 
-def summed_up(
+def sum_up(
     plan: CampaignPlan,
     tallies: dict[str, Tally],
     work: Work,

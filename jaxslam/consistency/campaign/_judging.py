@@ -18,7 +18,7 @@ from jaxslam.consistency._tally import Tally, condense
 from jaxslam.consistency.campaign._block import BOUND, BlockRunner, CampaignPlan, rows_of_truth
 from jaxslam.consistency.campaign._block_programs import fitting_block
 from jaxslam.consistency.campaign._candidates import candidate_for, check_noise
-from jaxslam.consistency.campaign._harness import near_the_origin, summed_up
+from jaxslam.consistency.campaign._harness import near_the_origin, sum_up
 from jaxslam.consistency.campaign._pieces import missing_pieces
 from jaxslam.consistency.campaign._progress import Progress
 from jaxslam.consistency.campaign._result import Campaign
@@ -186,7 +186,7 @@ def judge_sources(
         for name, estimator in judged.items():
             for (first, count), scores in zip(pieces, estimator.scores, strict=True):
                 tallies[name].add(first, count, condense(scores, first, limit))
-        campaign = summed_up(plan, tallies, work, origin, time.perf_counter() - began, compare=True)
+        campaign = sum_up(plan, tallies, work, origin, time.perf_counter() - began, compare=True)
         summaries = {
             name: judged[name].qualify(summary, pieces) if name in judged else summary
             for name, summary in campaign.filters.items()

@@ -15,7 +15,7 @@ from jaxtyping import Float, Int, PyTree
 
 from jaxslam.consistency._measures.measure import RunStatistics
 from jaxslam.consistency._run_scores import LAGS, Score, score
-from jaxslam.consistency.campaign._block import thinned
+from jaxslam.consistency.campaign._block import select_steps
 from jaxslam.consistency.campaign._block_programs import statistics_program
 from jaxslam.core._units import TURN
 from jaxslam.core.protocols import Sensor
@@ -71,7 +71,7 @@ class RunEstimate(NamedTuple):
 
 
 class RunFault(NamedTuple):
-    """Why a run is not judged."""
+    """The reason for which a run is not judged."""
 
     reason: str
     """as "missing"; runs are counted by it"""
@@ -365,7 +365,7 @@ def score_estimates(
     )
     measured = (info.status != Status.EMPTY).sum(axis=(1, 2))
     truth = truth._replace(missed=np.zeros((runs, shape.steps), int))
-    scores = score(*thinned(stride, trace, truth, statistics, None, measured))
+    scores = score(*select_steps(stride, trace, truth, statistics, None, measured))
     # Neither the coordinates of its error nor the measurements that it did not use are known.
     measures = {name: value for name, value in scores.measures.items() if name != "nees_own"}
     sums = dict(scores.sums)
