@@ -35,8 +35,8 @@ COMMANDS = {
         "test filters for consistency in a Monte-Carlo campaign",
         "Run filters over the same simulated worlds and compare their errors with the covariances "
         "they claim. Prints a table and writes JSON, CSV and figures. The exit status is 1 if a "
-        "filter is not finite, or its covariance not valid, in over 5 % of the runs or steps; "
-        "verdicts do not change it.",
+        "filter is not finite, or its covariance not valid, in over 5 % of the runs, steps or ends "
+        "of runs; verdicts do not change it.",
     ),
     "draws": (
         draws,
@@ -52,7 +52,7 @@ COMMANDS = {
         "draws`, by the tests of `jaxslam consistency`, and run filters of the library on the same "
         "draws. Prints a table and writes JSON, CSV, figures and a page. The exit status is 1 if "
         "an estimator has no finite estimate, or its covariance is not valid, in over 5 % of the "
-        "runs or steps; verdicts do not change it.",
+        "runs, steps or ends of runs; verdicts do not change it.",
     ),
     "run": (
         run,
