@@ -10,6 +10,7 @@ The gates: the EKFs of others have our EKF's verdict, and its pose NEES in each 
 of any of them is lost. A program that is absent is left out, and said to be.
 """
 
+import os
 import shlex
 import shutil
 import subprocess
@@ -60,15 +61,16 @@ def commands(folder: Path) -> dict[str, list[str]]:
     return words
 
 
-def judged(world, runs: int, folder: Path, programs: dict[str, list[str]], processes: int | None):
-    """The campaign of all programs and our filters on the same draws; faults by program and run."""
+def judged(world, runs: int, folder: Path, programs: dict[str, list[str]]):
+    """The campaign of all programs, on all cores, and of our filters on the same draws."""
     write_draws(world, runs, jax.random.key(0), folder / "draws")
     draws = read_draws(folder / "draws")
     sources = {}
     for name, words in programs.items():
         command = f"{shlex.join(words)} {{run}} {{estimate}}"
         estimates = folder / name
-        faults = Programs(command, draws.path, estimates, None).run(range(runs), processes)
+        cores = os.cpu_count() or 1
+        faults = Programs(command, draws.path, estimates, None).run(range(runs), cores)
         sources[name] = folder_source(estimates, draws, world.sensor.measurements, 1, faults)
     filters = {name: FILTERS[name](world) for name in OURS}
     return judge_sources(world, sources, runs, draws.key, filters=filters)
@@ -81,7 +83,7 @@ def measure(quick: bool = False) -> list[Metric]:
         world = make(steps)
         with tempfile.TemporaryDirectory() as temporary:
             folder = Path(temporary)
-            campaign = judged(world, runs, folder, commands(folder), 1)
+            campaign = judged(world, runs, folder, commands(folder))
         print(campaign, flush=True)
         rows, ours = {}, campaign.filters["ekf"]
         for name, summary in campaign.filters.items():
