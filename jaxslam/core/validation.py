@@ -40,6 +40,7 @@ __all__ = [
     "is_concrete",
     "mounting_pose",
     "names",
+    "not_negative",
     "one_of",
     "or_none",
     "positive",
@@ -198,6 +199,12 @@ def at_least(least: int) -> Check:
 def positive(value: Any) -> Any:
     """The check of a finite number above 0."""
     return in_range(0.0, math.inf, open=True)(value)
+
+
+def not_negative(value: Any) -> Any:
+    """The check of a finite number >= 0."""
+    finite(least=0.0)(value)
+    return value
 
 
 def in_range(low: float, high: float, *, open: bool = False) -> Check:
