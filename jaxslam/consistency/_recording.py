@@ -418,7 +418,7 @@ class _Claims(NamedTuple):
         if cov is None:
             return cls(unit, {name: np.zeros(count, bool) for name in DOF}, {}, turn)
         is_unknown = cov[:, 0, 0] == -1
-        by_part: dict[str, dict[str, np.ndarray]] = {}
+        faults_by_block: dict[str, dict[str, np.ndarray]] = {}
         valid = {}
         for name, axes in _AXES.items():
             block = cov[:, axes, axes]
@@ -433,23 +433,24 @@ class _Claims(NamedTuple):
                 "not symmetric": asymmetric(safe, 1e-6),  # of float32
                 "singular, or not positive definite": ~invertible(safe),
             }
-            faulty = np.zeros(count, bool)
-            by_part[name] = {}
-            for reason, fails in tests.items():  # the first reason that holds
-                by_part[name][reason] = fails & ~faulty
-                faulty = faulty | fails
-            others = block[~faulty]
-            constant = ~faulty & (len(others) > 1 and bool((others == others[:1]).all()))
-            by_part[name]["constant from beginning to end"] = constant
-            valid[name] = ~faulty & ~constant
+            # A pose has one fault: of several the first.
+            sound = np.ones(count, bool)
+            faults_by_block[name] = {}
+            for fault, fails in tests.items():
+                faults_by_block[name][fault] = sound & fails
+                sound = sound & ~fails
+            rest = block[sound]
+            is_constant = len(rest) > 1 and bool((rest == rest[:1]).all())
+            faults_by_block[name]["constant from beginning to end"] = sound & is_constant
+            valid[name] = sound & (not is_constant)
         valid["pose"] &= valid["position"] & valid["heading"]
         faults = {}
-        for reason, position in by_part["position"].items():
-            heading = by_part["heading"][reason]
+        for fault, position in faults_by_block["position"].items():
+            heading = faults_by_block["heading"][fault]
             both = position & heading
-            faults[f"covariance {reason}"] = both
-            faults[f"covariance of the position {reason}"] = position & ~both
-            faults[f"variance of the heading {reason}"] = heading & ~both
+            faults[f"covariance {fault}"] = both
+            faults[f"covariance of the position {fault}"] = position & ~both
+            faults[f"variance of the heading {fault}"] = heading & ~both
         apart = valid["position"] & valid["heading"] & ~valid["pose"]
         faults["covariance of position and heading singular together"] = apart
         usable = valid["position"] | valid["heading"]
