@@ -28,7 +28,7 @@ from jaxslam.core.validation import (
     refusals_of,
     require,
 )
-from jaxslam.math._definite import asymmetric, invertible
+from jaxslam.math._definite import is_asymmetric, is_invertible
 from jaxslam.math.numpy_poses import compose, inverse, wrapped
 from jaxslam.math.stats import chi2_quantile, normal_quantile, t_quantile
 
@@ -430,8 +430,8 @@ class _Claims(NamedTuple):
                 "not finite": ~finite,
                 "zero": (safe == 0).all(axis=(1, 2)),
                 f"above {LARGEST:g}": (variance > LARGEST).any(axis=1),
-                "not symmetric": asymmetric(safe, 1e-6),  # of float32
-                "singular, or not positive definite": ~invertible(safe),
+                "not symmetric": is_asymmetric(safe, 1e-6),  # of float32
+                "singular, or not positive definite": ~is_invertible(safe),
             }
             # A pose has one fault: of several the first.
             sound = np.ones(count, bool)

@@ -18,7 +18,7 @@ from jaxslam.consistency._tally import Tally, condense
 from jaxslam.consistency.campaign._block import BOUND, BlockRunner, CampaignPlan, rows_of_truth
 from jaxslam.consistency.campaign._block_programs import fitting_block
 from jaxslam.consistency.campaign._candidates import candidate_for, check_noise
-from jaxslam.consistency.campaign._harness import near_the_origin, sum_up
+from jaxslam.consistency.campaign._harness import move_to_start, sum_up
 from jaxslam.consistency.campaign._pieces import missing_pieces
 from jaxslam.consistency.campaign._progress import Progress
 from jaxslam.consistency.campaign._result import Campaign
@@ -173,7 +173,7 @@ def judge_sources(
         began, runs = time.perf_counter(), int(runs)
         devices = jax.local_devices() if devices is None else list(devices)
         size = int(block or (fitting_block(world, filters, devices[0]) if filters else 16))
-        near, near_filters, origin = near_the_origin(world, filters)
+        near, near_filters, origin = move_to_start(world, filters)
         plan = CampaignPlan(near, near_filters, key, devices, size, bound, None, stride)
         pieces = missing_pieces([], runs, plan.wide)
         judged = _judge_pieces(plan, sources, pieces, origin, progress)

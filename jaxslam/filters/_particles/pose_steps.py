@@ -35,7 +35,7 @@ from jaxslam.filters._particles.slam_particles import ParticleInfo
 from jaxslam.math._arrays import Number
 from jaxslam.resampling._kld import bins_of, enough
 from jaxslam.resampling._methods import systematic
-from jaxslam.resampling._weights import effective_size, normalized, survivors
+from jaxslam.resampling._weights import effective_size, normalize, survivors
 
 
 def update_averages(
@@ -198,7 +198,7 @@ class MonteCarloFilter(_Particles):
         used = jnp.arange(self.particles, dtype=active.dtype) < active
         log_weight = jnp.where(used, weight_resampled, -jnp.inf)
         # The sum becomes 1; its gradient is the resampling method's.
-        log_weight = log_weight - normalized(jax.lax.stop_gradient(log_weight))[1]
+        log_weight = log_weight - normalize(jax.lax.stop_gradient(log_weight))[1]
         log_weight = jnp.where(due, log_weight, state.log_weight)
         before = state.events
         return state._replace(
@@ -229,7 +229,7 @@ class MonteCarloFilter(_Particles):
             fit: the misfit that recovery compares with other scans (`update_averages`).
             measured: number of measurements of the scan.
         """
-        weight, _, some = normalized(state.log_weight - misfit)
+        weight, _, some = normalize(state.log_weight - misfit)
         even = jnp.where(active_mask(state), -jnp.log(state.active.astype(weight.dtype)), -jnp.inf)
         weight = jnp.where(some, weight, even)
         ess = effective_size(weight)
