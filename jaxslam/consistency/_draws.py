@@ -154,7 +154,7 @@ def _histories(
 
 
 def _identity(world: World, key: jax.Array) -> dict[str, str]:
-    """What agrees between two runs of one folder."""
+    """The part of the record that agrees between two calls for one folder."""
     parts = identity(world, {}, key, jax.default_backend())
     kept = {name: text for name, text in parts.items() if name not in _NOT_OF_DRAWS}
     return kept | {"filter options": digest(world.filter_options)}

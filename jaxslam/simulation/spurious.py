@@ -46,7 +46,7 @@ class Spurious:
 
     @property
     def places(self) -> int:
-        """How many measurement slots clutter adds to a scan."""
+        """The number of measurement slots that clutter adds to a scan."""
         return int(np.ceil(2 * self.clutter))
 
     def spoil(

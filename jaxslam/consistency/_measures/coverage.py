@@ -17,7 +17,7 @@ LEVELS = tuple(np.round(np.arange(0.05, 0.96, 0.05), 2).tolist()) + (0.99,)
 
 @dataclass(frozen=True, eq=False)
 class Credibility(Measure):
-    """One of the two numbers of `credibility`."""
+    """The noncredibility or the inclination of a filter, by `credibility`."""
 
     part: int = 0
 

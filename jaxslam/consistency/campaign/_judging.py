@@ -56,7 +56,7 @@ _FAULTS_OF_COV = {"asymmetric_steps": "not symmetric", "indefinite_steps": "not 
 
 
 class Outcome(NamedTuple):
-    """What an estimator makes of one run."""
+    """The result of an estimator on one run."""
 
     truth: Truth
     """what its estimate is compared with"""

@@ -226,7 +226,7 @@ def _tags_in_scans(seen: Seen[_Name], tag_of: dict[_Name, int]) -> Int[np.ndarra
 def _is_too_soon(
     seen: Seen[_Name], tag: Int[np.ndarray, "J"], used: Bool[np.ndarray, "J"]
 ) -> Bool[np.ndarray, "J"]:
-    """Which measurements come sooner after one of the same landmark than the spacing."""
+    """Mask of the measurements sooner after one of the same landmark than the spacing."""
     too_soon = np.zeros(len(tag), bool)
     if not seen.spacing:
         return too_soon

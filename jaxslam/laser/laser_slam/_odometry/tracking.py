@@ -96,7 +96,7 @@ class Odometry(NamedTuple):
 
 
 class Mode(Enum):
-    """What a scan can be matched with, and from where."""
+    """The mode of the tracking: where the match of the next scan is searched for."""
 
     STARTING = "no keyframe has points yet"
     TRACKING = "raw odometry leads here from the last match: search about it"
