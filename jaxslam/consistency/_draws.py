@@ -108,7 +108,8 @@ def write_draws(
     record = _record(world, key, runs, campaign, options)
 
     def write_record() -> None:
-        _write(folder / RECORD, _json(record | {"checksums": dict(sorted(checksums.items()))}))
+        content = record | {"checksums": dict(sorted(checksums.items()))}
+        _write(folder / RECORD, json.dumps(content, indent=2, ensure_ascii=False) + "\n")
 
     folder.mkdir(parents=True, exist_ok=True)
     for stale in folder.glob(f"{_UNFINISHED}*"):
@@ -256,10 +257,6 @@ def _write(path: Path, text: str) -> None:
     finally:
         with contextlib.suppress(OSError):
             hidden.unlink()
-
-
-def _json(content: Mapping[str, object]) -> str:
-    return json.dumps(content, indent=2, ensure_ascii=False) + "\n"
 
 
 def _sha256(content: bytes) -> str:

@@ -604,14 +604,10 @@ def _products(
     return np.asarray(lags[: len(u)])
 
 
-def _first_without(products: Float[np.ndarray, "n d d"]) -> int:
-    """The first lag with a trace of zero or less: how long errors are correlated, in poses."""
-    ends = np.trace(products, axis1=1, axis2=2) <= 0
-    return int(np.argmax(ends)) if ends.any() else len(products)
-
-
 def _correlation_length(z: Float[np.ndarray, "n d"]) -> int:
-    return _first_without(_products(z, z))
+    """The number of poses over which errors are correlated: the first lag with tr Σ z zᵀ <= 0."""
+    ends = np.trace(_products(z, z), axis1=1, axis2=2) <= 0
+    return int(np.argmax(ends)) if ends.any() else len(z)
 
 
 def _long_run(
