@@ -155,6 +155,7 @@ def align_tables(
     }
     tag_of = {name: tag for tag, name in enumerate(sort_names({*names, *named}))}
     tags = [_tags_in_scans(seen, tag_of) for seen in sensors]
+    # Those in a gap are outside of `within`, too, but have a count of their own.
     kept, outside, negative, beyond, soon = [], -in_gap, 0, 0, 0
     for seen, tag, inside in zip(sensors, tags, within, strict=True):
         when = seen.table.columns[TIME]

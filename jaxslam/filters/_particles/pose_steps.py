@@ -105,13 +105,14 @@ def resample_and_inject(
     )
 
 
-# The default least number of particles.
 _LEAST = 50
+"""The default of `MonteCarloFilter.least`."""
 
-# The bound on the number of particles: with this confidence the Kullback-Leibler divergence is
-# below the error, by bins of these sizes in x [m], y [m], θ [rad] (Fox 2003).
 _BINS = (0.5, 0.5, math.radians(15))
+"""Sizes of the bins in x [m], y [m], θ [rad] whose number bounds that of the particles."""
+
 _ERROR, _CONFIDENCE = 0.05, 0.99
+"""With this confidence the Kullback-Leibler divergence is below the error (Fox 2003)."""
 
 
 def _check_rates(rates: tuple[Number, Number]) -> tuple[Number, Number]:
