@@ -103,7 +103,10 @@ def write_draws(
         check_tables(world)
     odometry = odometry_of(world, world.controls)
     folder = Path(folder)
-    campaign = _identity(world, key)
+    parts = identity(world, {}, key, jax.default_backend())
+    # What agrees between two calls for one folder.
+    campaign = {name: text for name, text in parts.items() if name not in _NOT_OF_DRAWS}
+    campaign |= {"filter options": digest(world.filter_options)}
     checksums = _earlier_checksums(folder, campaign, runs)
     record = _record(world, key, runs, campaign, options)
 
@@ -152,13 +155,6 @@ def _histories(
             block = draw_block(world, key, first)
         place = number - first
         yield number, jax.tree.map(lambda leaf, i=place: leaf[i], block)
-
-
-def _identity(world: World, key: jax.Array) -> dict[str, str]:
-    """The part of the record that agrees between two calls for one folder."""
-    parts = identity(world, {}, key, jax.default_backend())
-    kept = {name: text for name, text in parts.items() if name not in _NOT_OF_DRAWS}
-    return kept | {"filter options": digest(world.filter_options)}
 
 
 def _record(

@@ -96,23 +96,30 @@ def _best_shift(
     )
     corner = jnp.asarray(np.array([[0, 0], [0, 1], [1, 0], [1, 1]], np.int32))
 
-    def unfinished(state: tuple[Array, _Nodes, Array, _Best]) -> Array:
+    def goes_on(state: tuple[Array, _Nodes, Array, _Best]) -> Array:
         size, _, value, best = state
         # With `count` blocks or fewer only roots are left, the best of them on top.
         rest_is_worse = (size <= count) & (value[jnp.maximum(size - 1, 0)] <= best.value)
-        goes_on = (size > 0) & ~rest_is_worse
-        return jnp.asarray(goes_on & (best.value <= above) if first else goes_on)
+        is_open = (size > 0) & ~rest_is_worse
+        return jnp.asarray(is_open & (best.value <= above) if first else is_open)
 
     def step(state: tuple[Array, _Nodes, Array, _Best]) -> tuple[Array, _Nodes, Array, _Best]:
         size, stack, value, best = state
-        at = size - 1 - jnp.arange(_CHUNK, dtype=size.dtype)
-        live = (at >= 0) & (value[jnp.maximum(at, 0)] > best.value)
-        parent = jax.tree.map(lambda part: jnp.repeat(part[jnp.maximum(at, 0)], 4, axis=0), stack)
+        # Take the top of the stack, from above; a stack of fewer blocks has none at the end of it.
+        place = size - 1 - jnp.arange(_CHUNK, dtype=size.dtype)
+        index = jnp.maximum(place, 0)
+        live = (place >= 0) & (value[index] > best.value)
+
+        # Divide each block into four, and bound these.
+        parent = jax.tree.map(lambda part: jnp.repeat(part[index], 4, axis=0), stack)
         level = parent.level - 1
         shift = parent.shift + (1 << level)[:, None] * jnp.tile(corner, (_CHUNK, 1))
         child = _Nodes(level, parent.turn, shift)
         bound = bound_of(child)
-        good = jnp.repeat(live, 4) & jnp.all(shift <= shifts, axis=1) & (bound > best.value)
+        in_window = jnp.repeat(live, 4) & jnp.all(shift <= shifts, axis=1)
+        good = in_window & (bound > best.value)
+
+        # Single shifts may be the best.
         leaf = level == 0
         score = jnp.where(good & leaf, bound, -jnp.inf)
         if counts is not None:
@@ -125,9 +132,10 @@ def _best_shift(
             jnp.where(better, shift[top], best.shift),
             best.divided + live.sum(dtype=jnp.int32),
         )
+
+        # Push the others: the shallow ones lowest, and of a level the best bound on top. What is
+        # not pushed follows, above the new size, where it is not read.
         pushed = good & ~leaf & (bound > best.value)
-        # Pushed children first, the shallow ones lowest, and of a level the best bound on top. The
-        # children that are not pushed follow, above the new size, where they are not read.
         rank = jnp.lexsort((bound, -level, ~pushed))
         base = size - jnp.minimum(size, _CHUNK)
 
@@ -141,7 +149,7 @@ def _best_shift(
     zero = jnp.zeros((), jnp.int32)
     nothing = _Best(jnp.asarray(above, bounds.dtype), zero, jnp.zeros(2, jnp.int32), zero)
     size = jnp.asarray(count, jnp.int32)
-    *_, best = jax.lax.while_loop(unfinished, step, (size, stack, value, nothing))
+    *_, best = jax.lax.while_loop(goes_on, step, (size, stack, value, nothing))
     return best
 
 
