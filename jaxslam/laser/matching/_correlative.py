@@ -105,7 +105,7 @@ def _best_shift(
 
     def step(state: tuple[Array, _Nodes, Array, _Best]) -> tuple[Array, _Nodes, Array, _Best]:
         size, stack, value, best = state
-        # Take the top of the stack, from above; a stack of fewer blocks has none at the end of it.
+        # Take the top of the stack; places below its bottom hold no block.
         place = size - 1 - jnp.arange(_CHUNK, dtype=size.dtype)
         index = jnp.maximum(place, 0)
         live = (place >= 0) & (value[index] > best.value)
