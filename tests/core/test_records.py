@@ -27,6 +27,7 @@ from jaxslam.core.validation import (
     at_least,
     finite,
     is_concrete,
+    not_negative,
     one_of,
     or_none,
     positive,
@@ -153,6 +154,7 @@ class Checked:
     mount: object = field(default=None, check=or_none(finite(3)))
     rule: object = field(default=None, check=or_none(function_of("z", "tag")))
     kind: object = static(default="plain", check=one_of("plain", "robust"))
+    spread: object = field(default=0.0, check=not_negative)
 
     def __post_init__(self):
         if is_concrete(self.width) and self.count > self.width:  # numbers, by their checks
@@ -187,6 +189,9 @@ class Below(Checked):
         (lambda: Checked(2.0, rule=Pair), "Checked", "rule", "expected a function of (z, tag), got the class Pair: call it, Pair(…)"),
         (lambda: Checked(2.0, kind=R[0]), "Checked", "kind", "expected a value that is compared by ==, got an array"),
         (lambda: Checked(2.0, kind=0), "Checked", "kind", 'expected "plain" or "robust", got 0'),
+        (lambda: Checked(2.0, spread=-1), "Checked", "spread", "expected a finite number >= 0, got -1"),
+        (lambda: Checked(2.0, spread=np.inf), "Checked", "spread", "expected a finite number >= 0, got inf"),
+        (lambda: Checked(2.0, spread=R[0]), "Checked", "spread", "expected a finite number >= 0, got an array of shape (2,)"),
         (lambda: Checked(2.0, 3), "Checked", "", "expected count <= width"),
         (lambda: Below(-1.0), "Below", "width", "expected a number above 0, got -1.0"),
         (lambda: Below(extra=3), "Below", "extra", "expected no 3"),
@@ -205,7 +210,8 @@ def test_a_refusal_says_owner_field_and_reason(make, owner, name, reason):
 
 
 def test_a_check_converts_and_is_not_run_where_jax_rebuilds():
-    made = Checked(2.0, mount=[1, 2, 3], rule=lambda z, tag: z)
+    made = Checked(2.0, mount=[1, 2, 3], rule=lambda z, tag: z, spread=1)
+    assert type(made.spread) is int
     assert made.mount.dtype == np.float64 and is_record(made.rule) and made.rule(1, 2) == 1
     again = dataclasses.replace(made, width=3.0)
     assert again.mount is made.mount and again.rule is made.rule
