@@ -16,7 +16,7 @@ from layouts import kept_programs, wrong_layouts
 from own_models import motion_of, sensor_of
 
 import jaxslam
-from jaxslam import World, catalog, filters, motion, run, sensors, simulate, smoothing
+from jaxslam import World, catalog, filters, linearize, motion, run, sensors, simulate, smoothing
 from jaxslam.core._record import is_record
 from jaxslam.core.protocols import Filter, Motion
 from jaxslam.core.record import field, function_of, record, static
@@ -120,6 +120,14 @@ class Still(World):
     """A world that draws nothing."""
 
 
+@record
+class OfMeasurements(linearize.AtEstimate):
+    """A linearizer whose new landmarks are functions of measurements alone."""
+
+    def invert(self, z):
+        return z
+
+
 @refused(
     (lambda: Pair("near"), "Pair: first: expected a number, an array or a record .* got 'near'"),
     (lambda: Pair([1.0, 2.0]), "Pair: first: expected an array, as of numpy.asarray, got a list"),
@@ -139,6 +147,7 @@ class Still(World):
     (Bare, "Bare: expected @record above the class"),
     (lambda: Later(R), "Later: expected @record above the class"),
     (Still, "Still: draw: expected a method, got none"),
+    (OfMeasurements, r"OfMeasurements: invert: expected a method of \(sensor, z, tag, point\), got one of \(z\)"),
     told="^",
 )  # fmt: skip
 def test_bad_input_is_one_line_that_names_the_class(make):
