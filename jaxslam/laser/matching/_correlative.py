@@ -181,7 +181,7 @@ class _Lattice(NamedTuple):
     """`Scores.table`"""
     valid: Bool[Array, "N"]
     """mask of the points"""
-    count: Float[Array, ""]
+    total: Float[Array, ""]
     """their number, at least 1"""
     sigma: float
     """[m]"""
@@ -201,7 +201,7 @@ class _Lattice(NamedTuple):
         # A flat index into (level, row, column): one gather.
         flat = (nodes.level[:, None] * height + row) * width + column
         score = self.table.reshape(-1)[flat]
-        return jnp.where(self.valid, score, 0.0).sum(axis=1) / self.count
+        return jnp.where(self.valid, score, 0.0).sum(axis=1) / self.total
 
     def prior_share(self, nodes: _Nodes) -> Float[Array, "n"]:
         """The score eᵀ Λ e/(2 σ² n) that a prior takes, at least, within each block.
@@ -223,7 +223,7 @@ class _Lattice(NamedTuple):
         far = jnp.maximum(((u @ prior.information[:2, :2]) * u).sum(axis=1).max(), 0.0)
         least = jnp.maximum(jnp.sqrt(square) - half * jnp.sqrt(far), 0.0)
         least = jnp.where(nodes.level == 0, square, least**2)
-        return least / (2 * self.sigma**2 * self.count)
+        return least / (2 * self.sigma**2 * self.total)
 
     def bound(self, nodes: _Nodes) -> Float[Array, "n"]:
         """An upper bound of the score within each block; of a single shift the score."""
@@ -334,7 +334,7 @@ class Correlative(Matcher):
             cells=jax.vmap(cells_at)(turns),
             table=prepared.table,
             valid=points.valid,
-            count=jnp.maximum(points.valid.sum(dtype=dtype), 1),
+            total=jnp.maximum(points.valid.sum(dtype=dtype), 1),
             sigma=sigma,
             prior=prior,
         )
