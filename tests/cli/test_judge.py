@@ -179,12 +179,15 @@ def test_rows_may_be_absent_where_they_are_not_judged(
 
 def test_an_empty_file_is_one_run_that_is_not_judged(draws, estimates, tmp_path, undrawn, capsys):
     (estimates / "0001" / "trajectory.csv").write_text("")
+    # a map without names has no measure, and no note
+    (estimates / "0000" / "map.csv").write_text("landmark,x,y,c_xx,c_xy,c_yy\n,1,1,1,0,1\n")
     assert judge(estimates, "--draws", draws, "--out", tmp_path / "out") == 1
     assert result(tmp_path / "out")["filters"]["mine"]["faults"] == {"ends early": [1]}
     printed = " ".join(capsys.readouterr().out.split())
     assert "1 of 3 runs is not judged: 1 ends early (run 1: trajectory.csv is empty): " in printed
     assert "mine is not judged in some runs: ends early in run 1" in printed
     assert "NIS" not in printed.split("honest:")[0] and "autocorrelation" not in printed
+    assert "landmark" not in printed
 
 
 def test_numbers_that_are_not_finite_are_counted(draws, estimates, tmp_path, undrawn):

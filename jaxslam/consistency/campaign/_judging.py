@@ -230,7 +230,8 @@ class _Judgement:
         if outcome.seconds is not None:
             self.seconds.append(outcome.seconds)
         if outcome.estimate is not None and outcome.estimate.maps is not None:
-            self.has_final_maps |= outcome.estimate.maps[2].ndim == 1
+            tags = outcome.estimate.maps[2]
+            self.has_final_maps |= tags.ndim == 1 and bool((tags >= 0).any())
         if number == 0 and outcome.estimate is not None:
             stride = self.plan.stride
             run_0 = with_positions(self.plan.scenario.sensor, outcome.truth)
