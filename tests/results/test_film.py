@@ -141,6 +141,7 @@ def test_an_ffmpeg_that_fails_is_one_line(three, tmp_path, monkeypatch, script, 
 
 def test_an_ffmpeg_that_does_not_start_or_is_not_there_is_named(tmp_path, monkeypatch):
     broken.program(monkeypatch, tmp_path, "ffmpeg", "#!/no/such/shell\n")
+    monkeypatch.setenv("PATH", str(tmp_path))  # else one that is installed is taken
     assert "Error: [Errno" in _film.mp4_problem()
     monkeypatch.setenv("PATH", str(tmp_path / "nothing"))
     assert _film.mp4_problem() == "ffmpeg is not installed"
