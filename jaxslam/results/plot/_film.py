@@ -24,6 +24,7 @@ from string import Template
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -298,11 +299,12 @@ def robot_at(pose: np.ndarray, size: float) -> np.ndarray:
     """The corners (3, 2) of a robot's triangle, `size` long from its position to its tip."""
     x, y, heading = pose
     cosine, sine = np.cos(heading), np.sin(heading)
-    return np.array([x, y]) + size * _ROBOT @ np.array([[cosine, sine], [-sine, cosine]])
+    turn = np.array([[cosine, sine], [-sine, cosine]])
+    corners: np.ndarray = np.array([x, y]) + size * _ROBOT @ turn
+    return corners
 
 
-def joined(lines: np.ndarray) -> np.ndarray:
+def joined(lines: Float[np.ndarray, "E C 2"]) -> Float[np.ndarray, "D 2"]:
     """Lines (E, C, 2) joined into one with NaN between them, so that they are drawn at once."""
     gap = np.full((len(lines), 1, 2), np.nan)
-    rows: np.ndarray = np.concatenate([lines, gap], axis=1)
-    return rows.reshape(-1, 2)
+    return np.concatenate([lines, gap], axis=1).reshape(-1, 2)

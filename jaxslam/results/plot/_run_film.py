@@ -308,8 +308,9 @@ def run_film(
     links = {}
     if isinstance(seen, Links):
         ends, strength, cut = _links_of(seen, history.estimate)
-        for name in _LINKS:
-            links[name] = LineCollection([], label=name, capstyle="round", zorder=2.6)
+        for name, (color, width) in _LINKS.items():
+            look = {"color": color, "linewidth": width, "capstyle": "round", "zorder": 2.6}
+            links[name] = LineCollection([], label=name, **look)
             main.add_collection(links[name], autolim=False)
         if any(map(len, cut)):
             look = {"color": INK, "lw": 1.0, "ls": (0, (1, 1.2)), "zorder": 2.8}

@@ -198,6 +198,10 @@ def test_links_appear_and_are_cut():
         next(collection for collection in axes.collections if collection.get_label() == label)
         for label in ("link of landmarks", "link to the robot")
     )
+    shown = {text.get_text() for text in film.figure.axes[1].get_legend().get_texts()}
+    assert {"link of landmarks", "link to the robot", "link cut"} <= shown
+    handles = film.figure.axes[1].get_legend().legend_handles
+    assert len({str(handle.get_color()) for handle in handles[:4]}) > 2
     for k, (of_robot, of_landmarks, cut) in enumerate([(1, 0, 0), (1, 1, 0), (0, 1, 1)]):
         draw(k)
         position, points = estimate.pose[k, :2], estimate.points[k]
