@@ -254,7 +254,7 @@ _BY_KIND: dict[str, dict[str, Callable[..., Candidate]]] = {
         ),
         # Its pose has no NEES: it is exact.
         "mapping": lambda world, **options: _OnTruePath(
-            on_given_poses(world, **options), np.asarray(world.pose)
+            on_given_poses(world, **options), np.asarray(world.pose)[:3]
         ),
     },
 }

@@ -100,12 +100,13 @@ class StartingAt(Wrapper):
     filter: Filter
     state: PyTree
     """independent of the arguments of `init`"""
+    further = True
 
     @property
     def name(self) -> str:  # type: ignore[override]
         return self.filter.name
 
-    def init(self, pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"]) -> PyTree:
+    def init(self, pose: Float[Array, "R"], pose_cov: Float[Array, "R R"]) -> PyTree:
         return jax.tree.map(jnp.asarray, self.state)
 
 

@@ -13,10 +13,27 @@ from jaxslam.association._rules import Known
 from jaxslam.core._numbers import held_array
 from jaxslam.core._record import field, function_of, record, set_field, static
 from jaxslam.core._validation import motion_model, sensor_model
-from jaxslam.core.protocols import Associate, Component, Filter, Motion, Sensor, Wrapper
+from jaxslam.core.protocols import (
+    POSE,
+    Associate,
+    Component,
+    Filter,
+    Motion,
+    Sensor,
+    Wrapper,
+    motion_of_pose,
+    sensor_of_robot,
+)
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate, Info, Log, Scan, Trace
-from jaxslam.core.validation import InvalidField, at_least, or_none, probability, refusals_of
+from jaxslam.core.validation import (
+    InvalidField,
+    at_least,
+    or_none,
+    probability,
+    refusals_of,
+    require,
+)
 from jaxslam.filters._ekf.ekf_slam import EkfSlam
 from jaxslam.math._arrays import Number
 from jaxslam.math._xla import hot_jit
@@ -125,6 +142,8 @@ class LogEstimator(Component):
                 "expected landmarks that measurement and prior determine, got "
                 f"{sensor.landmark} of {sensor.name}",
             )
+        require("motion", self.motion, motion_of_pose)
+        require("sensor", sensor, sensor_of_robot(POSE))
         for start in ("pose", "pose_cov"):
             set_field(self, start, held_array(getattr(self, start)))
         self._check(LogEstimator, {"solve": "log, key"})
