@@ -2,9 +2,9 @@
 
 The error e = x - μ, D = R + A·L numbers, R = 3 of a pose, has the information matrix Ω (D, D), the
 inverse of its covariance, and the information residual ρ = Ω E[e] (D,): the textbooks' information
-vector is ξ = Ω μ + ρ. Storing ρ instead of ξ is equivalent, and has advantages: a heading may wrap, a large
-map causes no cancellation in float32, ρ = 0 means that μ is the mean, and operations that keep the
-mean (sparsification: ξ̃ = ξ + (Ω̃ - Ω) μ) keep ρ.
+vector is ξ = Ω μ + ρ. Storing ρ instead of ξ is equivalent, and has advantages: a heading may wrap,
+a large map causes no cancellation in float32, ρ = 0 means that μ is the mean, and operations that
+keep the mean (sparsification: ξ̃ = ξ + (Ω̃ - Ω) μ) keep ρ.
 
 Padding, an index without a landmark: zero mean, zero links, unit diagonal of Ω, zero of ρ.
 Sources: Thrun et al., "Simultaneous localization and mapping with sparse extended information

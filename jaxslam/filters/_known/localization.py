@@ -59,7 +59,7 @@ from jaxslam.sensors._suite import of_robot
 class Localization(Filter):
     """Extended Kalman filter of the pose in a known map without errors (Williams, localization).
 
-    The equations of EKF-SLAM with P_ll = 0: z = h(x, l_j) with H by the robot alone, P (R, R), where
+    The equations of EKF-SLAM with P_ll = 0: z = h(x, l_j) with H by the robot alone, P (R, R): here
     R = 3, or 3 + E with the further numbers of `Motion.state`. A step costs O(M), plus the search
     for tags among N (0.09 ms a step with 10,000); association other than by tags compares all
     landmarks. With a `sensors.Suite`, absolute sensors (compass, position fix) correct in the same
