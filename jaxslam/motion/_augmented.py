@@ -1,6 +1,7 @@
 """Parameters of a motion model as slowly varying states."""
 
 import dataclasses
+import itertools
 import math
 
 import jax
@@ -18,11 +19,11 @@ from jaxslam.math._arrays import Control, ProcessNoise, Robot
 
 @record
 class Augmented(Motion):
-    """The motion model whose parameter is a state: p ← p + w_p, a random walk.
+    """The motion model some of whose parameters are states: p ← p + w_p, a random walk.
 
-    The k numbers of the field `parameter` of a model follow its state, and its own value there is
-    not used: start the robot with it. So what `jaxslam fit` holds constant, as the scales of
-    `Corrected`, the filter estimates as it drifts.
+    The k numbers of these fields of a model follow its state, and the values there are not used:
+    start the robot with them. So what `jaxslam fit` holds constant, as the scales of `Corrected`,
+    the filter estimates as it drifts.
 
         motion = Augmented(Corrected(Unicycle(Q)), "scale", noise=1e-3)
 
@@ -31,31 +32,30 @@ class Augmented(Motion):
     """
 
     motion: Motion = field(check=instance_of(Motion))
-    parameter: str = static()
-    """the name of a field of the model, of k numbers"""
+    parameter: str | tuple[str, ...] = static()
+    """the name of a field of the model, or of several, of k numbers together"""
     noise: ArrayLike = field()
     """() or (k,) standard deviation of the walk in a second, of a model with a control "dt [s]";
     of another one in a step"""
     unit: str = static(default="1", kw_only=True)
-    """of the parameter, for the names of the states"""
+    """of the parameters, for the names of the states"""
 
     def __post_init__(self) -> None:
         names = [field.name for field in dataclasses.fields(self.motion)]
-        if self.parameter not in names:
-            model = f"{type(self.motion).__name__}, {', '.join(names)}"
-            reason = f"expected a field of {model}, got {self.parameter!r}"
-            raise InvalidField("parameter", reason)
-        values = getattr(self.motion, self.parameter)
-        if dataclasses.is_dataclass(values) or real_array(values) is None:
-            reason = f"expected a field of numbers, got {self.parameter!r}"
-            raise InvalidField("parameter", reason)
-        shapes = (), (self._size,)
+        for name in self._parameters:
+            if name not in names:
+                model = f"{type(self.motion).__name__}, {', '.join(names)}"
+                raise InvalidField("parameter", f"expected a field of {model}, got {name!r}")
+            values = getattr(self.motion, name)
+            if dataclasses.is_dataclass(values) or real_array(values) is None:
+                raise InvalidField("parameter", f"expected a field of numbers, got {name!r}")
+        shapes = (), (len(self._names),)
         require("noise", self.noise, finite(*shapes[np.ndim(self.noise) > 0], least=0.0))
         super().__post_init__()
 
     @property
     def name(self) -> str:  # type: ignore[override]
-        return f"{self.motion.name} with {self.parameter}"
+        return f"{self.motion.name} with {' and '.join(self._parameters)}"
 
     @property
     def state(self) -> tuple[str, ...]:  # type: ignore[override]
@@ -76,25 +76,38 @@ class Augmented(Motion):
 
     def noise_cov(self, pose: Robot, u: Control) -> Array:
         of_model = self._model(pose).noise_cov(pose[: len(self.motion.state)], u)
-        variance = jnp.broadcast_to(jnp.asarray(self.noise, pose.dtype) ** 2, (self._size,))
+        variance = jnp.broadcast_to(jnp.asarray(self.noise, pose.dtype) ** 2, (len(self._names),))
         if "dt [s]" in self.controls:
             variance = variance * u[self.controls.index("dt [s]")]
         cov: Array = jax.scipy.linalg.block_diag(of_model, jnp.diag(variance))
         return cov
 
     @property
-    def _size(self) -> int:
-        """k."""
-        return math.prod(np.shape(getattr(self.motion, self.parameter)))
+    def _parameters(self) -> tuple[str, ...]:
+        return (self.parameter,) if isinstance(self.parameter, str) else self.parameter
+
+    @property
+    def _shapes(self) -> list[tuple[int, ...]]:
+        return [np.shape(getattr(self.motion, name)) for name in self._parameters]
 
     @property
     def _names(self) -> tuple[str, ...]:
-        if self._size == 1:
-            return (f"{self.parameter} [{self.unit}]",)
-        return tuple(f"{self.parameter} {k + 1} [{self.unit}]" for k in range(self._size))
+        """(k,) the names of the states."""
+        names: list[str] = []
+        for name, shape in zip(self._parameters, self._shapes, strict=True):
+            count = math.prod(shape)
+            numbers = [""] if count == 1 else [f" {k + 1}" for k in range(count)]
+            names += [f"{name}{number} [{self.unit}]" for number in numbers]
+        return tuple(names)
 
     def _model(self, robot: Robot) -> Motion:
-        """The model with the parameter of a robot's state."""
-        shape = np.shape(getattr(self.motion, self.parameter))
-        values = robot[len(self.motion.state) :].reshape(shape)
-        return dataclasses.replace(self.motion, **{self.parameter: values})
+        """The model with the parameters of a robot's state."""
+        sizes = [math.prod(shape) for shape in self._shapes]
+        ends = itertools.accumulate(sizes, initial=len(self.motion.state))
+        values = {
+            name: robot[first : first + size].reshape(shape)
+            for name, shape, size, first in zip(
+                self._parameters, self._shapes, sizes, ends, strict=False
+            )
+        }
+        return dataclasses.replace(self.motion, **values)

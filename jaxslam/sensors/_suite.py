@@ -288,6 +288,26 @@ class _OfRobot(Wrapped):
         return jnp.concatenate([robot[:3], *[robot[i : i + 1] for i in self.index]])
 
 
+def given(sensor: Sensor, further: Array) -> Sensor:
+    """The sensor of a pose alone, where the k numbers of the robot that it asks for are known."""
+    return _Given(sensor, further)
+
+
+@record
+class _Given(Wrapped):
+    """A sensor with the numbers (k,) of the robot that it asks for beside the pose."""
+
+    sensor: Sensor
+    further: Array
+    robot = ()
+
+    def observe(self, pose: Pose, landmark: Landmark) -> Measurement:
+        return self.sensor.observe(jnp.concatenate([pose, self.further]), landmark)
+
+    def invert(self, pose: Pose, z: Measurement, s: Unmeasured) -> Landmark:
+        return self.sensor.invert(jnp.concatenate([pose, self.further]), z, s)
+
+
 @record
 class _OnGround(Wrapped):
     """A sensor for landmarks of more numbers than it uses.
