@@ -62,6 +62,8 @@ class AtTruth(Linearizer):
         # Row t of the truth is the pose after motion t + 1; before the first it is the start.
         after = jnp.asarray(self.truth.robot)[jnp.maximum(step - 1, 0)]
         pose = jnp.where(step > 0, after, jnp.asarray(self.truth.start))
+        if self.truth.further is not None:  # a filter of the pose alone does not use the rest
+            pose = pose[: len(point.pose)]
         return pose.astype(point.pose.dtype)
 
     def _landmark(self, tag: Array, point: LinearizationPoint) -> Array:
