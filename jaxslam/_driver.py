@@ -146,7 +146,7 @@ def check_run(filter: Filter, log: Log, pose: ArrayLike, pose_cov: ArrayLike) ->
 
 def _notice_negative_ranges(filter: Filter, scan: Scan) -> None:
     """Warn of valid ranges below 0, where they are concrete."""
-    ranges = [name.startswith("range") for name in filter.measurements]
+    ranges = [name.split(" ")[0] == "range" for name in filter.measurements]
     if not any(ranges) or not is_concrete(scan):
         return
     negative = np.asarray(scan.valid) & (np.asarray(scan.z)[..., ranges] < 0).any(axis=-1)

@@ -495,7 +495,7 @@ class Linearizer(Component):
             },
         )
 
-    def init(self, pose: Pose, landmarks: Float[Array, "N L"]) -> PyTree:
+    def init(self, pose: Robot, landmarks: Float[Array, "N L"]) -> PyTree:
         """The first memory, of a start with landmarks (N, L) zeros: arrays of fixed shape."""
         return ()
 

@@ -452,7 +452,7 @@ def test_a_doppler_sensor_beside_the_centre_sees_the_rate_at_which_the_range_cha
 
 def test_velocities_are_found_without_odometry():
     """By Doppler, speedometer and gyroscope; a radar with the range rate knows its speed better."""
-    landmarks = np.asarray(ring(1).landmarks)
+    landmarks = 3 * np.asarray(ring(1).landmarks)
     model = motion.ConstantVelocity(motion.NoiseDensity(np.array([0.3, 0.2])))
     noise = np.diag([0.3, 0.03, 0.05]) ** 2
     start, cov = np.array([0.0, 0, 0, 1, 0.2]), np.diag([0, 0, 0, 0.5, 0.2]) ** 2
@@ -492,7 +492,7 @@ def test_mapping_is_given_the_velocity_with_the_pose():
     sensor = sensors.RangeRate(noise)
     world = Scenario("m", model, sensor, landmarks, controls, pose=start, pose_cov=np.zeros((5, 5)))
     truth, log = draw(world, 0)
-    method = catalog.FILTERS["mapping"](world)(truth)
+    method = catalog.ALL["mapping"](world)(truth)
     trace = jax.device_get(method(log, KEY))
     np.testing.assert_array_equal(trace.estimate.further[:, 0], truth.further[:, 0])
     final = jax.tree.map(lambda leaf: leaf[-1], trace.estimate)
@@ -605,7 +605,7 @@ def own(state, result=5):
         lambda: CompressedEkfSlam(EkfSlam(BIASED, POINT_SENSOR, 3), 2),
         "CompressedEkfSlam: .*pose alone.*bias",
     ),
-    (lambda: Merging(EkfSlam(BIASED, POINT_SENSOR, 3)), "Merging: .*pose alone.*bias"),
+    (lambda: Merging(EkfSlam(BIASED, POINT_SENSOR, 3), 1.0), "Merging: .*pose alone.*bias"),
     (
         lambda: Robot(BIASED, Suite(((POINT_SENSOR, 3),))),
         "Robot: motion: expected a model whose state is the pose",
@@ -624,7 +624,7 @@ def test_refusals(case):
 
 
 def test_a_filter_that_asks_for_a_state_the_world_has_not_is_refused():
-    world = replace(ring(5))
+    world = replace(ring(5), motion=UNICYCLE, controls=np.ones((5, 3)))
     filter = EkfSlam(BIASED, POINT_SENSOR, 3)
     with pytest.raises(ValueError, match=r"it estimates bias \[rad/s\], scale \[1\]") as caught:
         monte_carlo(world, {"mine": filter}, runs=2, key=KEY)

@@ -50,7 +50,7 @@ def measures_of_state(state: tuple[str, ...]) -> tuple[Measure, ...]:
         def square(error: Array, cov: Array) -> Array:
             unit = jnp.sqrt(jnp.diagonal(cov))  # to a unit diagonal: units differ
             unit = jnp.where(unit > 0, unit, 1.0)
-            root, positive = linalg.cholesky(cov / unit[:, None] / unit)
+            root, positive = linalg.cholesky(cov / (unit[:, None] * unit[None, :]))
             white = linalg.solve_lower(root, (error / unit)[:, None])
             return jnp.where(positive, (white**2).sum() / len(rows), jnp.nan)
 

@@ -284,7 +284,7 @@ def _linearize(
         pose = poses[0]  # the same for all landmarks
 
     def observe(
-        at: Int[Array, ""], landmark: Float[Array, "L"], cov: Float[Array, "R+L R+L"]
+        at: Int[Array, ""], landmark: Float[Array, "L"], cov: Float[Array, "K K"]
     ) -> PyTree:
         point = LinearizationPoint(state, chart, pose, cov, at, landmark)
         return filter.linearize.observe(at_slot(sensor, state, at), point)

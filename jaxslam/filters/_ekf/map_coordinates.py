@@ -215,6 +215,6 @@ def retract_map(chart: Chart, joint: Joint, xi: Float[Array, "D"]) -> Joint:
     robots, landmarks = over_landmarks(
         joint.robot, joint.landmarks, xi[:n], xi[n:].reshape(joint.landmarks.shape)
     )
+    joint = joint.with_robot(robots[0])  # the same for all landmarks
     # dx alone moves a dead landmark too in some charts: the direction of a ray turns with the map.
-    landmarks = jnp.where(joint.alive[:, None], landmarks, 0.0)
-    return joint.with_robot(robots[0])._replace(landmarks=landmarks)
+    return joint._replace(landmarks=jnp.where(joint.alive[:, None], landmarks, 0.0))
