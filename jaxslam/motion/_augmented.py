@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from jaxslam.core._record import field, record, static
 from jaxslam.core._reprs import real_array
 from jaxslam.core.protocols import Motion
-from jaxslam.core.validation import InvalidField, finite, instance_of, require
+from jaxslam.core.validation import InvalidField, finite, instance_of, is_concrete, require
 from jaxslam.math._arrays import Control, ProcessNoise, Robot
 
 
@@ -88,7 +88,9 @@ class Augmented(Motion):
 
     @property
     def _shapes(self) -> list[tuple[int, ...]]:
-        return [np.shape(getattr(self.motion, name)) for name in self._parameters]
+        values = [getattr(self.motion, name) for name in self._parameters]
+        # A tuple of numbers that are traced has a shape in JAX alone.
+        return [np.shape(v) if is_concrete(v) else jnp.asarray(v).shape for v in values]
 
     @property
     def _names(self) -> tuple[str, ...]:

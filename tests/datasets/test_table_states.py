@@ -97,7 +97,7 @@ def test_errors_of_the_odometry_are_states_too(tmp_path):
 @pytest.mark.sweep
 def test_fit_finds_the_walk_of_a_state(tmp_path, capsys):
     folder = write(tmp_path, recorded() | {"dataset.toml": BIASED})
-    arguments = ["fit", str(folder), "--fixed", "motion v,motion omega,sensor range,sensor bearing"]
+    arguments = ["fit", str(folder), "--fix", "motion v,motion omega,sensor range,sensor bearing"]
     assert run_command([*arguments, "--write", "--out", str(tmp_path / "out")]) == 0
     assert "state bias" in capsys.readouterr().out
     fitted = datasets.table(folder)
