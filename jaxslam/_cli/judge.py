@@ -113,7 +113,7 @@ def _judge_estimates(options: argparse.Namespace, command: str) -> int:
         raise ValueError("ESTIMATES: expected a folder of estimates, got none")
     if options.draws is None:
         raise ValueError("--draws: expected the folder of `jaxslam draws`, got none")
-    folders = _named([Path(folder) for folder in options.estimates])
+    folders = _name_folders([Path(folder) for folder in options.estimates])
     draws = read_draws(Path(options.draws))
     runs = draws.runs if options.runs is None else options.runs
     for name, count in (
@@ -175,7 +175,7 @@ def _judge_estimates(options: argparse.Namespace, command: str) -> int:
     return FAILED if is_wrong or failed else 0
 
 
-def _named(folders: list[Path]) -> dict[str, Path]:
+def _name_folders(folders: list[Path]) -> dict[str, Path]:
     """Folders by their names, which name the columns of the table."""
     named: dict[str, Path] = {}
     for folder in folders:

@@ -28,7 +28,7 @@ from jaxslam.core.validation import (
     refusals_of,
     require,
 )
-from jaxslam.math._definite import asymmetric, invertible
+from jaxslam.math._definite import is_asymmetric, is_invertible
 from jaxslam.math.numpy_poses import compose, inverse, wrapped
 from jaxslam.math.stats import chi2_quantile, normal_quantile, t_quantile
 
@@ -418,7 +418,7 @@ class _Claims(NamedTuple):
         if cov is None:
             return cls(unit, {name: np.zeros(count, bool) for name in DOF}, {}, turn)
         is_unknown = cov[:, 0, 0] == -1
-        by_part: dict[str, dict[str, np.ndarray]] = {}
+        faults_by_block: dict[str, dict[str, np.ndarray]] = {}
         valid = {}
         for name, axes in _AXES.items():
             block = cov[:, axes, axes]
@@ -430,26 +430,27 @@ class _Claims(NamedTuple):
                 "not finite": ~finite,
                 "zero": (safe == 0).all(axis=(1, 2)),
                 f"above {LARGEST:g}": (variance > LARGEST).any(axis=1),
-                "not symmetric": asymmetric(safe, 1e-6),  # of float32
-                "singular, or not positive definite": ~invertible(safe),
+                "not symmetric": is_asymmetric(safe, 1e-6),  # of float32
+                "singular, or not positive definite": ~is_invertible(safe),
             }
-            faulty = np.zeros(count, bool)
-            by_part[name] = {}
-            for reason, fails in tests.items():  # the first reason that holds
-                by_part[name][reason] = fails & ~faulty
-                faulty = faulty | fails
-            others = block[~faulty]
-            constant = ~faulty & (len(others) > 1 and bool((others == others[:1]).all()))
-            by_part[name]["constant from beginning to end"] = constant
-            valid[name] = ~faulty & ~constant
+            # A pose has one fault: of several the first.
+            sound = np.ones(count, bool)
+            faults_by_block[name] = {}
+            for fault, fails in tests.items():
+                faults_by_block[name][fault] = sound & fails
+                sound = sound & ~fails
+            rest = block[sound]
+            is_constant = len(rest) > 1 and bool((rest == rest[:1]).all())
+            faults_by_block[name]["constant from beginning to end"] = sound & is_constant
+            valid[name] = sound & (not is_constant)
         valid["pose"] &= valid["position"] & valid["heading"]
         faults = {}
-        for reason, position in by_part["position"].items():
-            heading = by_part["heading"][reason]
+        for fault, position in faults_by_block["position"].items():
+            heading = faults_by_block["heading"][fault]
             both = position & heading
-            faults[f"covariance {reason}"] = both
-            faults[f"covariance of the position {reason}"] = position & ~both
-            faults[f"variance of the heading {reason}"] = heading & ~both
+            faults[f"covariance {fault}"] = both
+            faults[f"covariance of the position {fault}"] = position & ~both
+            faults[f"variance of the heading {fault}"] = heading & ~both
         apart = valid["position"] & valid["heading"] & ~valid["pose"]
         faults["covariance of position and heading singular together"] = apart
         usable = valid["position"] | valid["heading"]
@@ -603,14 +604,10 @@ def _products(
     return np.asarray(lags[: len(u)])
 
 
-def _first_without(products: Float[np.ndarray, "n d d"]) -> int:
-    """The first lag with a trace of zero or less: how long errors are correlated, in poses."""
-    ends = np.trace(products, axis1=1, axis2=2) <= 0
-    return int(np.argmax(ends)) if ends.any() else len(products)
-
-
 def _correlation_length(z: Float[np.ndarray, "n d"]) -> int:
-    return _first_without(_products(z, z))
+    """The number of poses over which errors are correlated: the first lag with tr Σ z zᵀ <= 0."""
+    ends = np.trace(_products(z, z), axis1=1, axis2=2) <= 0
+    return int(np.argmax(ends)) if ends.any() else len(z)
 
 
 def _long_run(

@@ -150,7 +150,7 @@ def folder_source(
         gap[:, 2] = np.minimum(gap[:, 2], np.abs(2 * math.pi - gap[:, 2]))
         if not (largest := float(gap.max())) <= _SAME:
             path = draws.path / TRUTH / name / "truth.csv"
-            raise _other_draws(path, draws, f"poses that differ by {largest:.3g}")
+            raise _draws_error(path, draws, f"poses that differ by {largest:.3g}")
         if number == 0:  # the other runs have the same key
             _check_log(draws, name, measurements, log)
         truth = truth._replace(pose=in_file.pose)
@@ -175,14 +175,14 @@ def _check_log(draws: DrawsFolder, name: str, measurements: Sequence[str], log: 
     in_file = CsvTable(path).table(measurements, "of measurements").values(measurements)
     drawn = np.asarray(log.scan.z, np.float64)[valid]
     if in_file.shape != drawn.shape:
-        raise _other_draws(path, draws, f"{len(in_file)} lines, where {len(drawn)} are drawn")
+        raise _draws_error(path, draws, f"{len(in_file)} lines, where {len(drawn)} are drawn")
     # Lines of one time are in any order.
     largest = float(np.abs(np.sort(in_file, axis=0) - np.sort(drawn, axis=0)).max())
     if not largest <= _SAME:
-        raise _other_draws(path, draws, f"numbers that differ by {largest:.3g}")
+        raise _draws_error(path, draws, f"numbers that differ by {largest:.3g}")
 
 
-def _other_draws(path: Path, draws: DrawsFolder, got: str) -> InvalidFile:
+def _draws_error(path: Path, draws: DrawsFolder, got: str) -> InvalidFile:
     """The error about a file that is not what the scenario draws."""
     return InvalidFile(
         path,

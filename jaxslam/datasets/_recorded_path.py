@@ -148,7 +148,7 @@ def _path_in_csv(path: Path) -> RecordedPath:
         upper, lower = np.triu_indices(3)
         cov = np.empty((len(time), 3, 3))
         cov[:, upper, lower] = cov[:, lower, upper] = columns.values(entries)
-    return _recorded(str(path), time, pose, cov, notes=notes)
+    return _make_path(str(path), time, pose, cov, notes=notes)
 
 
 def _path_in_tum(path: Path) -> RecordedPath:
@@ -165,7 +165,7 @@ def _path_in_tum(path: Path) -> RecordedPath:
     if not (finite := np.isfinite(pose).all(axis=1)).all():
         row = int(np.argmin(finite))
         raise file.error(numbers[row], f"expected a quaternion of norm 1, got {rows[row][4:]}")
-    return _recorded(str(path), table[:, 0], pose, None)
+    return _make_path(str(path), table[:, 0], pose, None)
 
 
 def _check_rising(time: Float[np.ndarray, "K"], at: Callable[[int], str]) -> None:
@@ -176,7 +176,7 @@ def _check_rising(time: Float[np.ndarray, "K"], at: Callable[[int], str]) -> Non
         raise ValueError(f"{at(int(back[0]) + 1)}: expected a time above {before}, got {after}")
 
 
-def _recorded(
+def _make_path(
     source: str,
     time: Float[np.ndarray, "K"],
     pose: Float[np.ndarray, "K 3"],
@@ -252,7 +252,7 @@ def _path_in_bag(source: str, path: Path, inside: str) -> RecordedPath:
         usable = [message for message, fine in zip(messages, finite, strict=True) if fine]
         stamp, kept = in_order(bag, topic.name, "messages", usable, dropped, notes)
         covs = [usable[k].cov for k in kept if usable[k].cov is not None]
-    return _recorded(
+    return _make_path(
         source,
         seconds(stamp),
         pose[finite][kept],
@@ -317,7 +317,7 @@ def _path_of_frames(source: str, bag: Bag, parent: str, child: str) -> RecordedP
     if lost := int((~is_known).sum()):
         dropped["times at which a transform between is unknown"] = lost
     pose = between(*ends)[is_known]
-    return _recorded(
+    return _make_path(
         source,
         seconds(stamp)[is_known],
         pose,

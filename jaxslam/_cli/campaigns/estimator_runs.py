@@ -96,7 +96,7 @@ class Programs:
             places = ((self._draws / RUNS / name).absolute(), estimate)
             words = [_with_places(word, places) for word in self._words]
             began = time.perf_counter()
-            with said.open("wb") as file, self._started(words, file.fileno()) as process:
+            with said.open("wb") as file, self._start(words, file.fileno()) as process:
                 try:
                     status = process.wait(self._limit)
                 except subprocess.TimeoutExpired:
@@ -118,7 +118,7 @@ class Programs:
         return None
 
     @contextlib.contextmanager
-    def _started(self, words: Sequence[str], said: int) -> Iterator[subprocess.Popen[bytes]]:
+    def _start(self, words: Sequence[str], said: int) -> Iterator[subprocess.Popen[bytes]]:
         """A program that writes to the file `said`; it has ended when the context is left."""
         with self._lock:  # none is started once all are stopped
             if self._stops:

@@ -92,7 +92,7 @@ def run(options: argparse.Namespace, command: str = "jaxslam judge") -> int:
 
 
 def source_notes(align: str, estimate: RecordedPath, truth: RecordedPath) -> list[str]:
-    """What was left out of the two sources, what the readers assumed, and frames that differ."""
+    """Notes on the two sources: rows left out, assumptions of the readers, frames that differ."""
     notes = []
     for path in (estimate, truth):
         notes += [f"{path.source}: {note}" for note in path.notes]

@@ -163,7 +163,7 @@ def print_summary(summary: Json, runs: Mapping[str, FilterRun]) -> None:
         return
     of_data = {key: value for key, value in summary.items() if key != "filters"}
     print(summary_table({"": of_data}), end="\n\n")
-    print(summary_table({name: _flat(run.summary) for name, run in runs.items()}))
+    print(summary_table({name: _flatten(run.summary) for name, run in runs.items()}))
     for name, run in runs.items():
         if notes := run.summary.get("notes"):
             print(summary_table({"": {name: notes}}))
@@ -201,7 +201,7 @@ def write_runs(
     return write_results(folder, files, drawings, FILMS)
 
 
-def _flat(summary: Json) -> Json:
+def _flatten(summary: Json) -> Json:
     """The summary as rows of one value: one per status that occurs, one per coordinate."""
     status, final = summary["status"], summary["final pose"]
     assert isinstance(status, dict)
