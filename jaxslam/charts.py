@@ -19,7 +19,7 @@ from jaxslam.math import se2
 from jaxslam.math._arrays import Landmark, Pose, Robot
 from jaxslam.math.angles import wrap
 
-__all__ = ["REGISTRY", "Euclidean", "LeftInvariant", "RightInvariant"]
+__all__ = ["REGISTRY", "Euclidean", "LeftInvariant", "RightInvariant", "with_further"]
 
 
 @record

@@ -72,6 +72,8 @@ __all__ = [
     "Resample",
     "Sensor",
     "Wrapper",
+    "motion_of_pose",
+    "sensor_of_robot",
 ]
 
 

@@ -288,13 +288,13 @@ class _OfRobot(Wrapped):
         return jnp.concatenate([robot[:3], *[robot[i : i + 1] for i in self.index]])
 
 
-def given(sensor: Sensor, further: Array) -> Sensor:
+def conditioned(sensor: Sensor, further: Array) -> Sensor:
     """The sensor of a pose alone, where the k numbers of the robot that it asks for are known."""
-    return _Given(sensor, further)
+    return _Conditioned(sensor, further)
 
 
 @record
-class _Given(Wrapped):
+class _Conditioned(Wrapped):
     """A sensor with the numbers (k,) of the robot that it asks for beside the pose."""
 
     sensor: Sensor

@@ -287,7 +287,7 @@ class TableSettings:
         self._text, self.content = _read(path)
         if not path.exists():
             self.assumed.append(f"no {path.name}")
-        names = ("name", "source", "motion", "state", "sensor", "filter", "calibration")
+        names = ("name", "source", "motion", "sensor", "filter", "calibration", "state")
         self._check_keys("", self.content, names)
         for name in names:
             kind = str if name in ("name", "source") else dict
@@ -373,22 +373,22 @@ class TableSettings:
         """The systematic errors that [state] names as further states, and `_state_names` set."""
         section = self.content.get("state", {})
         self._check_keys("state", section, ("names", "start", "start_noise", "noise"))
-        own = [split_unit(name)[0] for name in bare.state[3:]]
-        names = section.get("names", own)
-        known = own or (list(_ODOMETRY_ERRORS) if correctable else [])
-        fit = isinstance(names, list) and all(name in known for name in names)
+        of_model = [split_unit(name)[0] for name in bare.state[3:]]
+        names = section.get("names", of_model)
+        possible = of_model or (list(_ODOMETRY_ERRORS) if correctable else [])
+        fit = isinstance(names, list) and all(name in possible for name in names)
         if (
             not fit
-            or (own and names != own)
+            or (of_model and names != of_model)
             or len(set(names)) < len(names)
             or (section and not names)
         ):
-            among = ", ".join(known) or "none"
+            among = ", ".join(possible) or "none"
             raise ValueError(
-                f"{self._at('state', 'names')}: expected {'' if own else 'some of '}{among}, the "
-                f"states of {bare.name}, got {names!r}"
+                f"{self._at('state', 'names')}: expected {'' if of_model else 'some of '}{among}, "
+                f"the states of {bare.name}, got {names!r}"
             )
-        if own:
+        if of_model:
             self._state_names = tuple(bare.state[3:])
             return ()
         self._state_names = tuple(

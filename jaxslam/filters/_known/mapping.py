@@ -36,7 +36,7 @@ from jaxslam.filters._particles.slam_particles import (
 )
 from jaxslam.math._arrays import Number
 from jaxslam.math.angles import wrap
-from jaxslam.sensors._suite import given
+from jaxslam.sensors._suite import conditioned
 
 
 @record
@@ -99,7 +99,7 @@ class Mapping(ParticleMapFilter):
     def update(self, state: SlamParticles, scan: Scan, key: Array) -> tuple[SlamParticles, Info]:
         scan, filter = zero_padding(scan), self
         if self.sensor.robot:
-            filter = dataclasses.replace(self, sensor=given(self.sensor, state.further))
+            filter = dataclasses.replace(self, sensor=conditioned(self.sensor, state.further))
         association = associate_particle(filter, state, scan)
         # The pose is known, so the proposal does not change it; the other results are used.
         proposed, innovations = propose_pose(filter, state, association, scan)

@@ -402,7 +402,7 @@ def _truth(
 
 def _map(history: History) -> list[Layer]:
     """The layers of the landmarks with their ellipses; none for a filter without a map."""
-    _, _, points, covs, alive, _ = map(np.asarray, history.estimate)
+    _, _, points, covs, alive, _ = map(np.asarray, history.estimate[:6])
     if not np.any(alive):
         return []
     ring: Look = {"color": COLORS[1], "lw": 1.0, "zorder": 4}
