@@ -18,6 +18,7 @@ from jaxslam.consistency._intervals import LEVEL, Average, percentage
 from jaxslam.consistency._measures.nees import DOF
 from jaxslam.consistency._verdict import TOLERANCE
 from jaxslam.consistency.metrics._paths import alignment
+from jaxslam.core._units import are_headings_in_degrees
 from jaxslam.core.logs._streams import geodesic_poses, known_poses
 from jaxslam.core.validation import (
     InvalidField,
@@ -50,6 +51,10 @@ _AXES = {"pose": slice(0, 3), "position": slice(0, 2), "heading": slice(2, 3)}
 _FAULTY = 0.05
 """Share of the poses without a valid covariance beyond which the others do not decide, as of the
 runs of a campaign."""
+
+_SHARE_OF_FRAMES = 0.1
+"""Share of the position errors that the best rigid motion leaves, below which the estimate and the
+truth may be in two frames."""
 
 _HALF = 0.1
 """Half of the time over which the velocity of the truth is taken [s], at least: the noise of a
@@ -246,8 +251,9 @@ def judge_recording(
         longest_gap: the longest interval of the truth that is interpolated [s]; default ten times
             its median.
     Raises:
-        ValueError: on other shapes, times that do not rise, poses that are not finite, fewer than
-            two times of the estimate at which the truth is known.
+        ValueError: on other shapes, times that do not rise, poses that are not finite, headings
+            that fit the positions in degrees, fewer than two times of the estimate at which the
+            truth is known.
     """
     with refusals_of("judge_recording"):
         require("align", align, one_of(*ALIGNMENTS))
@@ -306,6 +312,8 @@ def judge_recording(
         sigma[ok, _AXES[name]] = np.sqrt(variance[ok, _AXES[name]])
     compared = error[is_compared]
     doubts = list(aligned.notes)
+    if align == "none":
+        doubts += _frames_note(pose[is_compared], true[is_compared])
     if cov is None:
         doubts.append("the estimate has no covariance: its errors alone are measured")
     elif not blocks:
@@ -346,7 +354,26 @@ def _stamped_poses(
         raise ValueError(
             f"expected times that rise, got {after} in row {back[0] + 1} after {before}"
         )
+    if are_headings_in_degrees(pose):
+        raise ValueError("expected headings in radians, got some that fit the positions in degrees")
     return time, pose
+
+
+def _frames_note(pose: Float[np.ndarray, "n 3"], truth: Float[np.ndarray, "n 3"]) -> list[str]:
+    """A sentence where nearly all of the position errors are one rigid motion, as of two frames."""
+    if not np.ptp(truth[:, :2], axis=0).any():  # positions show no turn
+        return []
+    carried = compose(alignment(truth[:, :2], pose[:, :2]), truth)
+    before, after = (
+        float(np.sqrt(((path[:, :2] - pose[:, :2]) ** 2).sum(axis=1).mean()))
+        for path in (truth, carried)
+    )
+    if not after < _SHARE_OF_FRAMES * before:
+        return []
+    return [
+        f"one rigid motion of the truth reduces its distance from the estimate from {before:.3g} m "
+        f"to {after:.3g} m (RMS): if the two are in different frames, align best"
+    ]
 
 
 class _Rows(NamedTuple):

@@ -97,7 +97,8 @@ def recorded_path(source: str | Path) -> RecordedPath:
         ValueError: with the file, and its line or topic: on a source that cannot be read, a topic
             or a frame that is not there, without messages or of another type, poses in several
             frames, stamps of which more than a tenth go back; in files also on times that do not
-            rise, numbers that are not finite, and a covariance of fewer than six columns.
+            rise, numbers that are not finite, headings without a unit that fit the positions in
+            degrees, and a covariance of fewer than six columns.
     """
     text = str(source)
     places = [k for k, letter in enumerate(text) if letter == ":"]
@@ -142,7 +143,12 @@ def _path_in_csv(path: Path) -> RecordedPath:
     pose = columns.values(wanted[1:])
     notes = [file.dialect] if file.dialect else []
     if are_headings_in_degrees(pose):
-        notes.append(f"{file.path.name}: theta fits the positions in degrees: write theta [deg]")
+        raise InvalidFile(
+            file.path,
+            "expected theta in radians, but it fits the positions in degrees: "
+            + ("write radians" if entries else "write theta [deg]"),
+            file.head_line,
+        )
     cov = None
     if entries:
         upper, lower = np.triu_indices(3)

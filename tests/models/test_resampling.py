@@ -301,7 +301,7 @@ def test_headings_on_both_sides_of_the_seam_and_poses_far_away_have_bins():
     size = (1.0, 1.0, 2 * math.pi / 6)
     pose = np.array([[0, 0, np.pi], [0, 0, -np.pi], [1e300, -1e300, 0.0], [-0.5, 0.5, 0.0]])
     bins = np.asarray(jax.jit(partial(_kld.bins_of, size=size))(pose))
-    occupied = jax.jit(_kld.occupied)
+    occupied = jax.jit(_kld.count_distinct)
     np.testing.assert_array_equal(bins[:2], [[0, 0, 5], [0, 0, 0]])
     np.testing.assert_array_equal(bins[3], [-1, 0, 3])
     np.testing.assert_array_equal(occupied(bins), [1, 2, 3, 4])

@@ -16,6 +16,13 @@ from jaxslam.results._files import Files, Json, csv_text, json_number, json_text
 
 DRAWING = "errors"
 
+OPTIONS: dict[str, tuple[str, object]] = {
+    "--align": ("align", "none"),
+    "--covariance-frame": ("covariance_frame", "world"),
+    "--gap": ("gap", None),
+}
+"""Field and default of each option of a recording besides its two sources."""
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options for a recording, without those of folder and figures."""

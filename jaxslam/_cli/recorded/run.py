@@ -260,8 +260,8 @@ def _true_path(data: Dataset, evaluation: Evaluation) -> Float[np.ndarray, "T 3"
 
 def _films(data: Dataset, runs: Mapping[str, FilterRun]) -> Files:
     """The film of each filter, by file name; see `film_files`."""
-    from jaxslam.results import plot  # matplotlib is slow to load
-    from jaxslam.results.plot._run_film import History, frame_steps, run_scene
+    # Matplotlib is slow to load.
+    from jaxslam.results.plot._run_film import History, frame_steps, run_film
 
     films = {}
     for name, (result, evaluation, _) in runs.items():
@@ -275,11 +275,10 @@ def _films(data: Dataset, runs: Mapping[str, FilterRun]) -> Files:
             slot=result.slot,
             seen=result.watched,
         )
-        scene = run_scene(
+        films[name] = run_film(
             history,
             true_points=evaluation.points,
             true_path=_true_path(data, evaluation),
             title=f"{data.name}: {name}",
         )
-        films[name] = plot.Film(scene)
     return film_files(films, suffixed=len(films) > 1)

@@ -230,7 +230,8 @@ class _Judgement:
         if outcome.seconds is not None:
             self.seconds.append(outcome.seconds)
         if outcome.estimate is not None and outcome.estimate.maps is not None:
-            self.has_final_maps |= outcome.estimate.maps[2].ndim == 1
+            tags = outcome.estimate.maps[2]
+            self.has_final_maps |= tags.ndim == 1 and bool((tags >= 0).any())
         if number == 0 and outcome.estimate is not None:
             stride = self.plan.stride
             run_0 = with_positions(self.plan.scenario.sensor, outcome.truth)
@@ -277,12 +278,14 @@ class _Judgement:
         """The sentence on runs that are not judged."""
         parts = []
         for reason, numbers in by_reason.items():
-            details = [f"run {n}: {self.faults[n].detail}" for n in numbers if n in self.faults]
+            found = [(n, self.faults[n].detail) for n in numbers if n in self.faults]
+            details = [f"run {n}: {detail}" for n, detail in found if detail]
             listed = "; ".join(details[:_LISTED]) + "; …" * (len(details) > _LISTED)
             parts.append(f"{len(numbers):,} {reason}" + f" ({listed})" * bool(listed))
         lost = sum(map(len, by_reason.values()))
         averages = f"averages of the {rest:,} judged runs" if rest else "there are no averages"
-        return f"{lost:,} of {lost + rest:,} runs are not judged: {', '.join(parts)}: {averages}"
+        verb = "is" if lost == 1 else "are"
+        return f"{lost:,} of {lost + rest:,} runs {verb} not judged: {', '.join(parts)}: {averages}"
 
     def notes(self) -> list[str]:
         """The texts below the table."""

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from jaxslam._driver import check_run, run
 from jaxslam.association._rules import Known
 from jaxslam.core._numbers import as_array
-from jaxslam.core._record import field, function_of, record, set_field, static
+from jaxslam.core._record import check_field, field, function_of, record, static
 from jaxslam.core._validation import motion_model, sensor_model
 from jaxslam.core.protocols import (
     Associate,
@@ -147,7 +147,7 @@ class LogEstimator(Component):
             reason = f"expected further states that are no angles, got {', '.join(angles)}"
             raise InvalidField("motion", reason)
         for start in ("pose", "pose_cov"):
-            set_field(self, start, as_array(getattr(self, start)))
+            check_field(self, start, as_array)
         self._check(LogEstimator, {"solve": "log, key"})
 
     def solve(self, log: Log, key: Array) -> Trace:
