@@ -72,8 +72,9 @@ def run(
     Args:
         filter: a record, as of `jaxslam.filters`.
         log: T rows; control (T, U), scans of M measurement slots.
-        pose: (3,) where the robot is before the first control.
-        pose_cov: (3, 3) its covariance; zero is allowed.
+        pose: (3,) where the robot is before the first control; of a motion model with E further
+            numbers in its state, all 3 + E.
+        pose_cov: (3, 3), or (3 + E, 3 + E), its covariance; zero is allowed.
         key: a PRNG key, split into two a step; a filter without randomness ignores them.
         probe: called with the filter's state after each update; its results are stacked.
     Returns:
@@ -139,13 +140,13 @@ def check_run(filter: Filter, log: Log, pose: ArrayLike, pose_cov: ArrayLike) ->
                 f"it has a measurement of landmark {tag}, the map of {filter.name} has {size}, "
                 f"0 to {size - 1}; a map of some landmarks needs their tags",
             )
-    require("pose", pose, finite(3))
-    require("pose_cov", pose_cov, covariance(3))
+    require("pose", pose, finite(len(filter.robot_state)))
+    require("pose_cov", pose_cov, covariance(len(filter.robot_state)))
 
 
 def _notice_negative_ranges(filter: Filter, scan: Scan) -> None:
     """Warn of valid ranges below 0, where they are concrete."""
-    ranges = [name.startswith("range") for name in filter.measurements]
+    ranges = [name.split(" ")[0] == "range" for name in filter.measurements]
     if not any(ranges) or not is_concrete(scan):
         return
     negative = np.asarray(scan.valid) & (np.asarray(scan.z)[..., ranges] < 0).any(axis=-1)

@@ -120,7 +120,9 @@ def _is_relative(
     poses = np.zeros((_TRIALS, 3))
     poses[:, :2] = points[:, :2] + rng.standard_normal((_TRIALS, 2))
     poses[:, 2] = rng.uniform(-3, 3, _TRIALS)
-    poses[0] = pose
+    poses[0] = pose[:3]
+    beside = getattr(model, "state", (0, 0, 0))[3:] or getattr(model, "robot", ())
+    poses = np.concatenate([poses, rng.uniform(0.5, 1.0, (_TRIALS, len(beside)))], axis=1)
     width = len(getattr(model, "controls", ())) or 1
     rows = np.resize(
         0.1 if controls is None else np.asarray(controls, np.float64), (_TRIALS, width)
@@ -133,7 +135,7 @@ def _is_relative(
 @jax.jit
 def _change(
     model: PyTree,
-    poses: Float[Array, "K 3"],
+    poses: Float[Array, "K R"],
     points: Float[Array, "K L"],
     controls: Float[Array, "K U"],
     origin: Float[Array, "2"],

@@ -164,7 +164,7 @@ def doubt_on_run(
     rounding = rounding_of(
         filter,
         dtype,
-        np.concatenate([single.pose_cov, start_cov[None]]),
+        np.concatenate([single.pose_cov, start_cov[None, :3, :3]]),
         np.concatenate([start[None, :2], single.pose[:, :2], points[-1:][alive[-1:]]]),
         float(variances[variances > 0].min(initial=np.inf)),
     )

@@ -109,12 +109,24 @@ class _OnTruePath:
 
     filter: Filter
     start: ArrayLike
+    further: tuple[int, ...] = static(default=())
+    """which of `Truth.further` the sensor asks for, in its order"""
 
     def __call__(self, truth: Truth) -> Estimator:
         poses = jnp.asarray(truth.pose)
+        if self.further:
+            poses = jnp.concatenate(
+                [poses, jnp.asarray(truth.further)[:, np.array(self.further)]], axis=1
+            )
+        exact = np.zeros((3 + len(self.further),) * 2)
         return lambda log, key: run(
-            self.filter, log._replace(control=poses), self.start, np.zeros((3, 3)), key
+            self.filter, log._replace(control=poses), self.start, exact, key
         )
+
+
+def _on_true_path(filter: Filter, world: World) -> _OnTruePath:
+    rows = [world.motion.state.index(name) for name in filter.robot_state]
+    return _OnTruePath(filter, np.asarray(world.pose)[rows], tuple(k - 3 for k in rows[3:]))
 
 
 # --- filters for a scenario: each takes the options of `EkfSlam`, and uses the ones that it has ---
@@ -253,9 +265,7 @@ _BY_KIND: dict[str, dict[str, Callable[..., Candidate]]] = {
             )
         ),
         # Its pose has no NEES: it is exact.
-        "mapping": lambda world, **options: _OnTruePath(
-            on_given_poses(world, **options), np.asarray(world.pose)
-        ),
+        "mapping": lambda world, **options: _on_true_path(on_given_poses(world, **options), world),
     },
 }
 """Filters by kind and name. Baselines are the worst and the best cases of a SLAM filter: no

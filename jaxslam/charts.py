@@ -5,18 +5,21 @@ whose filter is known to be inconsistent; and of the right-invariant one, in whi
 robot and map is one constant direction.
 """
 
+from collections.abc import Callable
+
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from jaxslam.core._names import Named
-from jaxslam.core._record import record, static
+from jaxslam.core._record import field, record, static
 from jaxslam.core.protocols import Basis, Chart
 from jaxslam.core.validation import InvalidField
 from jaxslam.math import se2
-from jaxslam.math._arrays import Landmark, Pose
+from jaxslam.math._arrays import Landmark, Pose, Robot
 from jaxslam.math.angles import wrap
 
-__all__ = ["REGISTRY", "Euclidean", "LeftInvariant", "RightInvariant"]
+__all__ = ["REGISTRY", "Euclidean", "LeftInvariant", "RightInvariant", "with_further"]
 
 
 @record
@@ -36,6 +39,57 @@ class Euclidean(Chart):
 
 def _wrap_heading(pose: Pose) -> Array:
     return jnp.concatenate([pose[:2], wrap(pose[2:])])
+
+
+@record
+class _WithFurther(Chart):
+    """The chart of a robot (3 + E,): another chart for its pose, differences for the rest."""
+
+    chart: Chart = field()
+    turns: tuple[bool, ...] = static()
+    """(E,) which of the further numbers are angles"""
+
+    @property
+    def name(self) -> str:  # type: ignore[override]
+        return self.chart.name
+
+    @property
+    def landmark_size(self) -> int | None:  # type: ignore[override]
+        return self.chart.landmark_size
+
+    @property
+    def basis(self) -> Callable[[Array, Array], Basis] | None:
+        return None if self.chart.basis is None else self._basis
+
+    def retract(
+        self, pose: Robot, landmark: Landmark, dx: Robot, dl: Landmark
+    ) -> tuple[Robot, Landmark]:
+        moved, landmark = self.chart.retract(pose[:3], landmark, dx[:3], dl)
+        return jnp.concatenate([moved, self._wrapped(pose[3:] + dx[3:])]), landmark
+
+    def local(
+        self, pose0: Robot, landmark0: Landmark, pose: Robot, landmark: Landmark
+    ) -> tuple[Robot, Landmark]:
+        dx, dl = self.chart.local(pose0[:3], landmark0, pose[:3], landmark)
+        return jnp.concatenate([dx, self._wrapped(pose[3:] - pose0[3:])]), dl
+
+    def _wrapped(self, further: Array) -> Array:
+        return jnp.where(np.array(self.turns), wrap(further), further)
+
+    def _basis(self, pose: Robot, landmark: Landmark) -> Basis:
+        basis: Basis = self.chart.basis(pose[:3], landmark)
+        e = len(self.turns)
+        of_pose = jnp.eye(3 + e, dtype=pose.dtype).at[:3, :3].set(basis.pose)
+        return Basis(of_pose, jnp.pad(basis.cross, [(0, 0), (0, e)]), basis.landmark)
+
+
+def with_further(chart: Chart, state: tuple[str, ...]) -> Chart:
+    """The chart of a robot with these numbers (`Motion.state`); the same where it is a pose.
+
+    The errors of the further numbers are differences, wrapped where they are in [rad].
+    """
+    turns = tuple(name.endswith("[rad]") for name in state[3:])
+    return _WithFurther(chart, turns) if turns else chart
 
 
 @record

@@ -19,13 +19,15 @@ from jaxslam.linearize import _first_order as first_order
 from jaxslam.linearize._first_order import with_lever_arm
 from jaxslam.linearize._other_points import AtTruth
 from jaxslam.math._linalg import root_psd
-from jaxslam.sensors._suite import Suite
+from jaxslam.sensors._suite import Suite, of_robot
 from jaxslam.simulation._recorded import RecordedWorld
 from jaxslam.simulation._worlds import Scenario, World
 
 
 def conditional_bound(scenario: World, truth: Truth, log: Log, key: Array) -> Estimate:
     """The Cramér-Rao bound given a true trajectory, as the covariances of an `Estimate` (T,).
+
+    Of a motion model with further numbers in its state, `further_cov` bounds theirs.
 
     It bounds the covariance of estimators that are unbiased *given that trajectory and map*; the
     average over runs of such estimators' mean square errors lies above the average of the bounds. A
@@ -94,9 +96,10 @@ def posterior_bound(
         rows = list(_by_parameters(jax.tree.map(lambda leaf, i=i: leaf[i], runs), start, at))
         by_p = by_p + np.stack([a for a, _ in rows]) / count
         information = information + np.stack([gained for _, gained in rows]) / count
-    random = 3 + total * runs.by_noise.shape[3]
+    random = len(start) + total * runs.by_noise.shape[3]
     prior = np.diag((np.arange(information.shape[1]) < random).astype(float))
-    return at, np.stack([_invert(a, prior + j) for a, j in zip(by_p, information, strict=True)])
+    bounds = [_invert(a[:3], prior + j) for a, j in zip(by_p, information, strict=True)]
+    return at, np.stack(bounds)
 
 
 def van_trees(
@@ -123,7 +126,7 @@ def van_trees(
 class SensorJacobians(NamedTuple):
     """The Jacobians of one sensor's measurements in a run, at the truth."""
 
-    by_pose: Float[Array, "T M Z 3"]
+    by_pose: Float[Array, "T M Z R"]
     by_landmark: Float[Array, "T M Z L"]
     noise_cov: Float[Array, "T M Z Z"]
     tag: Int[Array, "T M"]
@@ -135,9 +138,9 @@ class SensorJacobians(NamedTuple):
 class RunJacobians(NamedTuple):
     """The Jacobians of the models along the true path of one run."""
 
-    by_pose: Float[Array, "T 3 3"]
+    by_pose: Float[Array, "T R R"]
     """∂f/∂x of the motion"""
-    by_noise: Float[Array, "T 3 W"]
+    by_noise: Float[Array, "T R W"]
     """∂f/∂w √Q of the motion"""
     sensors: list[SensorJacobians]
     landmarks: Float[Array, "N L"]
@@ -149,7 +152,7 @@ def jacobians_at_truth(scenario: World, truth: Truth, log: Log) -> RunJacobians:
     For the world of one robot, nothing spurious, tags known.
     """
     motion, dtype = scenario.motion, truth.pose.dtype
-    path, landmarks = jnp.asarray(truth.pose), jnp.asarray(truth.landmarks)
+    path, landmarks = jnp.asarray(truth.robot), jnp.asarray(truth.landmarks)
     old = jnp.concatenate([truth.start[None], path[:-1]])
     still = jnp.zeros(len(motion.noises), dtype)
 
@@ -168,7 +171,8 @@ def jacobians_at_truth(scenario: World, truth: Truth, log: Log) -> RunJacobians:
     )
     sensors: list[SensorJacobians] = []
     first = 0
-    for model, places in parts:
+    for part, places in parts:
+        model = of_robot(part, motion.state)
 
         def observe_jacobians(
             pose: Array, tag: Array, model: Sensor = model
@@ -186,7 +190,7 @@ def jacobians_at_truth(scenario: World, truth: Truth, log: Log) -> RunJacobians:
 
 
 def final_covariance(
-    jacobians: RunJacobians, pose_cov: Float[np.ndarray, "3 3"]
+    jacobians: RunJacobians, pose_cov: Float[np.ndarray, "R R"]
 ) -> Float[np.ndarray, "3 3"]:
     """The covariance of the last pose in `conditional_bound`, of one run, by NumPy.
 
@@ -194,22 +198,22 @@ def final_covariance(
     measurement, where that determines it, and otherwise with a deviation of 100 times the map's
     reach. A billionth of the reach is added to the noise of measurements, which may be none.
     """
-    count, size = jacobians.landmarks.shape
+    (count, size), n = jacobians.landmarks.shape, len(pose_cov)
     # Deviations relative to the map's reach: large enough for "unknown" (100), and small enough
     # that a measurement without noise has an innovation covariance with an inverse (1e-9).
     reach = 1.0 + float(np.max(np.abs(jacobians.landmarks), initial=0.0))
-    cov = np.zeros((3 + count * size,) * 2)
-    cov[:3, :3] = pose_cov
+    cov = np.zeros((n + count * size,) * 2)
+    cov[:n, :n] = pose_cov
     in_map = np.zeros(count, bool)
     for t in range(len(jacobians.by_pose)):
-        cov[:3] = jacobians.by_pose[t] @ cov[:3]
-        cov[:, :3] = cov[:, :3] @ jacobians.by_pose[t].T
-        cov[:3, :3] += jacobians.by_noise[t] @ jacobians.by_noise[t].T
+        cov[:n] = jacobians.by_pose[t] @ cov[:n]
+        cov[:, :n] = cov[:, :n] @ jacobians.by_pose[t].T
+        cov[:n, :n] += jacobians.by_noise[t] @ jacobians.by_noise[t].T
         for seen in jacobians.sensors:
             for i in np.flatnonzero(seen.valid[t]):
                 by_pose, by_landmark = seen.by_pose[t, i], seen.by_landmark[t, i]
                 noise = seen.noise_cov[t, i] + (1e-9 * reach) ** 2 * np.eye(len(by_pose))
-                begin = 3 + int(seen.tag[t, i]) * size
+                begin = n + int(seen.tag[t, i]) * size
                 block = slice(begin, begin + by_landmark.shape[1])
                 if by_landmark.shape[1] and not in_map[seen.tag[t, i]]:
                     in_map[seen.tag[t, i]] = True
@@ -217,34 +221,34 @@ def final_covariance(
                     # of its position would be lost, and 12 of its covariance.
                     if by_landmark.shape == (size, size) and np.linalg.cond(by_landmark) < 1e6:
                         by = np.linalg.inv(by_landmark)
-                        cov[block] = -by @ by_pose @ cov[:3]
+                        cov[block] = -by @ by_pose @ cov[:n]
                         cov[:, block] = cov[block].T
-                        cov[block, block] = by @ (by_pose @ cov[:3, :3] @ by_pose.T + noise) @ by.T
+                        cov[block, block] = by @ (by_pose @ cov[:n, :n] @ by_pose.T + noise) @ by.T
                         continue
                     parameters = slice(begin, begin + size)
                     cov[parameters, parameters] = (100 * reach) ** 2 * np.eye(size)
-                cross = by_pose @ cov[:3] + by_landmark @ cov[block]
-                innovation = cross[:, :3] @ by_pose.T + cross[:, block] @ by_landmark.T + noise
+                cross = by_pose @ cov[:n] + by_landmark @ cov[block]
+                innovation = cross[:, :n] @ by_pose.T + cross[:, block] @ by_landmark.T + noise
                 cov -= cross.T @ np.linalg.solve(innovation, cross)
         cov = (cov + cov.T) / 2
     return cov[:3, :3]
 
 
 def _by_parameters(
-    run: RunJacobians, start: Float[np.ndarray, "3 3"], at: Int[np.ndarray, "K"]
-) -> Iterator[tuple[Float[np.ndarray, "3 P"], Float[np.ndarray, "P P"]]]:
+    run: RunJacobians, start: Float[np.ndarray, "R R"], at: Int[np.ndarray, "K"]
+) -> Iterator[tuple[Float[np.ndarray, "R P"], Float[np.ndarray, "P P"]]]:
     """The derivative ∂x_t/∂p, and the information on p of the scans until then, at steps `at`."""
-    steps, _, width = run.by_noise.shape
+    steps, n, width = run.by_noise.shape
     count, size = run.landmarks.shape
-    map_at = 3 + steps * width
-    by_p = np.zeros((3, map_at + count * size))
-    by_p[:, :3] = start
+    map_at = n + steps * width
+    by_p = np.zeros((n, map_at + count * size))
+    by_p[:, :n] = start
     information = np.zeros((by_p.shape[1],) * 2)
     kept = {}
     white = [_whiten(sensor) for sensor in run.sensors]
     for t in range(steps):
         by_p = np.asarray(run.by_pose[t]) @ by_p
-        by_p[:, 3 + t * width : 3 + (t + 1) * width] = run.by_noise[t]
+        by_p[:, n + t * width : n + (t + 1) * width] = run.by_noise[t]
         for (by_pose, by_landmark), sensor in zip(white, run.sensors, strict=True):
             rows = by_pose[t] @ by_p
             for i, tag in enumerate(sensor.tag[t]):

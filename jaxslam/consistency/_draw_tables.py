@@ -73,6 +73,9 @@ def check_tables(world: World) -> None:
             f"{', '.join(part.sensor.name for part in sensor.parts)}"
         )
         raise InvalidField("sensor", reason, owner=owner)
+    if further := world.motion.state[3:]:
+        reason = f"expected a state that is the pose, as truth.csv has it, got {', '.join(further)}"
+        raise InvalidField("motion", reason, owner=owner)
     if sensor.landmark and not sensor.of_points and not sensor.landmark[0].startswith("x"):
         reason = (
             "expected landmarks that are points, as landmarks.csv has them, got "

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from jaxslam.consistency._measures import REGISTRY
+from jaxslam.consistency._measures import REGISTRY, further
 from jaxslam.consistency._measures.associations import association_scores, identities
 from jaxslam.consistency._measures.counts import counts_of
 from jaxslam.consistency._measures.measure import Measure, Nees, Runs, RunStatistics
@@ -105,7 +105,8 @@ def score(
     runs = Runs(truth, trace, statistics, error, nees)
     measures: dict[str, tuple[np.ndarray, np.ndarray]] = {}
     finite = np.array(statistics.finite)
-    for measure in REGISTRY.values():
+    of_state = filter(None, map(further.measure_of, statistics.values))
+    for measure in (*REGISTRY.values(), *of_state):
         scores = measure.of_runs(runs)
         if scores is None:
             continue

@@ -40,7 +40,8 @@ class Summary:
     rotation_information [1/rad²] (0): the dimension of the filter's unobservable subspace, and what
     it has learnt of a turn of the whole frame. log_likelihood (mean a run; none without an
     innovation). In a world with spurious data: precision and recall of associations, and
-    false_landmarks; see `associations`.
+    false_landmarks; see `associations`. Of a motion with further numbers in its state, as v or a
+    bias: nees_of_v, nees_of_bias (1), and nees_further (1), of all together over how many they are.
     """
     nis_band: tuple[float, float] | None
     """95 % band of nis_per_dof from the summed degrees of freedom; None without a measurement."""

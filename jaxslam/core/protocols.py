@@ -3,8 +3,9 @@
 Every method, and field that is a function, is pure and traceable and acts on *one* pose, landmark
 or scan; the caller vmaps. The numbers of a motion model or a sensor are the leaves of a record.
 
-Shapes: pose (3,); u (U,) control; w (W,) process noise; z (Z,) measurement; l (L,) landmark
-parameters; s (K,) landmark parameters that z does not determine (K = 0 if none).
+Shapes: pose (3,); robot (3 + E,) the pose, then E further numbers of a motion model's state, E = 0
+of most; u (U,) control; w (W,) process noise; z (Z,) measurement; l (L,) landmark parameters;
+s (K,) landmark parameters that z does not determine (K = 0 if none).
 """
 
 import re
@@ -42,12 +43,14 @@ from jaxslam.math._arrays import (
     Point,
     Pose,
     ProcessNoise,
+    Robot,
     Unmeasured,
 )
 from jaxslam.math.angles import wrap
 
 __all__ = [
     "NOTHING_FREE",
+    "POSE",
     "Associate",
     "Association",
     "Basis",
@@ -69,6 +72,8 @@ __all__ = [
     "Resample",
     "Sensor",
     "Wrapper",
+    "motion_of_pose",
+    "sensor_of_robot",
 ]
 
 
@@ -165,14 +170,36 @@ class Model(Component):
             check_field(self, "noise_cov", _noise_of(type(self), size))
 
 
+POSE = ("x [m]", "y [m]", "theta [rad]")
+"""The numbers of a pose, with which every `Motion.state` begins."""
+
+
+def _check_state(value: Any) -> Any:
+    """The check of a `Motion.state`: the pose, then different names with units."""
+    names(value)
+    if value[:3] != POSE or len(set(value)) < len(value):
+        raise ValueError(f"expected the pose {POSE}, then other names, got {value}")
+    for name in value[3:]:
+        if re.fullmatch(r"[^\[\]]+ \[[^\[\]]+\]", name) is None:
+            raise ValueError(
+                f'expected a unit of each number, as "v [m/s]" or "k [1]", got {name!r}'
+            )
+    return value
+
+
 class Motion(Model):
     """A motion model, one class for simulator and filters; w = 0 is the nominal motion.
 
     A subclass is a record (`core.record`) that declares controls and noises, has a field noise_cov,
-    or a method of that name, and defines `step`. Raises ValueError, at construction, on a
-    bad covariance, names other than a tuple of strings, or a missing method.
+    or a method of that name, and defines `step`. It may declare a `state` of more than the pose:
+    robot (3 + E,) then takes the place of the pose in all its methods, and 3 + E that of 3.
+    Raises ValueError, at construction, on a bad covariance, names other than a tuple of strings, a
+    state without units, or a missing method.
     """
 
+    state: tuple[str, ...] = POSE
+    """What robot holds, with units: the pose, then E further numbers, as "v [m/s]" or a bias. Those
+    in [rad] are angles, wrapped by `step`."""
     controls: tuple[str, ...]
     """What u holds, with units; its length is U."""
     noises: tuple[str, ...]
@@ -187,9 +214,10 @@ class Motion(Model):
 
     def __post_init__(self) -> None:
         self._check_model(Motion, ("step",), ("controls", "noises"))
+        check_field(self, "state", _check_state)
 
-    def step(self, pose: Pose, u: Control, w: ProcessNoise) -> Pose:
-        """The pose after a control, θ wrapped."""
+    def step(self, pose: Robot, u: Control, w: ProcessNoise) -> Robot:
+        """The pose after a control, or the robot after it; θ wrapped."""
         raise NotImplementedError
 
 
@@ -218,8 +246,9 @@ class Sensor(Model):
 
     A subclass is a record (`core.record`) that declares measurements, has a field noise_cov, or a
     method of that name, and defines `observe` and `invert`; the rest has a default. It may have a
-    field `mount`, and then observes from `frame(pose)`. Raises ValueError, at construction, on a
-    bad covariance or mount, names other than a tuple of strings, or a missing method.
+    field `mount`, and then observes from `frame(pose)`. One that measures more than the pose, as a
+    velocity, declares these numbers as `robot`. Raises ValueError, at construction, on a bad
+    covariance or mount, names other than a tuple of strings, or a missing method.
 
     An absolute sensor (a compass, a satellite receiver) has no landmark: l is (0,), invert and
     embed return (0,), position unused zeros, and K = 0. Each of its measurements
@@ -233,6 +262,10 @@ class Sensor(Model):
     others are not limited. The verifier tries `invert` at no other measurement."""
     landmark: tuple[str, ...] = ("x [m]", "y [m]")
     """What l holds, with units; its length is L, 0 for an absolute sensor."""
+    robot: tuple[str, ...] = ()
+    """The k numbers of the robot that it needs beside the pose, by their names in `Motion.state`:
+    `observe` and `invert`, and their Jacobians, get the pose followed by these, (3 + k,), in place
+    of the pose, for any other numbers of the state, in any order. The rest takes the pose."""
     noise_cov: Any
     """(z) -> (Z, Z), R where the exact measurement is z. Given as a covariance, a record with
     `__call__`, or a function. Worlds call it at the exact measurement, filters at the predicted
@@ -253,7 +286,7 @@ class Sensor(Model):
     """the points that landmarks may turn into; None where they never do"""
 
     def __post_init__(self) -> None:
-        self._check_model(Sensor, ("observe", "invert"), ("landmark", "measurements"))
+        self._check_model(Sensor, ("observe", "invert"), ("robot", "landmark", "measurements"))
         check_field(self, "support", self._check_support)
         if not isinstance(getattr(type(self), "free", None), property):
             check_field(self, "free", instance_of(Free))
@@ -270,11 +303,11 @@ class Sensor(Model):
                 )
         return support
 
-    def observe(self, pose: Pose, landmark: Landmark) -> Measurement:
+    def observe(self, pose: Robot, landmark: Landmark) -> Measurement:
         """The measurement z of a landmark."""
         raise NotImplementedError
 
-    def invert(self, pose: Pose, z: Measurement, s: Unmeasured) -> Landmark:
+    def invert(self, pose: Robot, z: Measurement, s: Unmeasured) -> Landmark:
         """The landmark with observe(pose, invert(pose, z, s)) = z; a range is not negative."""
         raise NotImplementedError
 
@@ -292,12 +325,14 @@ class Sensor(Model):
         rest = max(len(self.landmark) - 2, 0)
         return jnp.concatenate([point, jnp.zeros(rest, point.dtype)]) if rest else point
 
-    def frame(self, pose: Pose) -> Pose:
-        """The pose of the sensor, pose ∘ mount."""
+    def frame(self, pose: Robot) -> Pose:
+        """The pose of the sensor, pose ∘ mount; what follows the pose is not used."""
+        pose = pose[:3] if self.robot else pose
         return pose if self.mount is None else se2.compose(pose, self._mount(pose))
 
-    def frame_jacobian(self, pose: Pose) -> Float[Array, "3 3"]:
+    def frame_jacobian(self, pose: Robot) -> Float[Array, "3 3"]:
         """The derivative of `frame` by the pose."""
+        pose = pose[:3] if self.robot else pose
         if self.mount is None:
             return jnp.eye(3, dtype=pose.dtype)
         return se2.compose_jacobians(pose, self._mount(pose))[0]
@@ -333,6 +368,30 @@ class Sensor(Model):
         turns = np.array([name.endswith("[rad]") for name in self.landmark[2:]], bool)
         rest = jnp.where(turns, wrap(landmark[2:] + frame[2]), landmark[2:])
         return jnp.concatenate([se2.from_frame(frame, landmark[:2]), rest])
+
+
+def motion_of_pose(motion: Motion) -> Motion:
+    """The check of a motion model whose state is the pose, without further numbers."""
+    if further := motion.state[3:]:
+        raise ValueError(
+            f"expected a model whose state is the pose, got {motion.name} with {', '.join(further)}"
+        )
+    return motion
+
+
+def sensor_of_robot(state: tuple[str, ...]) -> Check:
+    """The check of a sensor, or a suite, of a robot whose state has the numbers it asks for."""
+
+    def check(value: Sensor) -> Sensor:
+        for sensor in [part.sensor for part in getattr(value, "parts", ())] or [value]:
+            if missing := [name for name in sensor.robot if name not in state]:
+                raise ValueError(
+                    f"{sensor.name} asks for {', '.join(missing)}, the state of the motion has "
+                    f"{', '.join(state)}"
+                )
+        return value
+
+    return check
 
 
 class Basis(NamedTuple):
@@ -373,22 +432,22 @@ class Chart(Component):
         """The errors (dx, dl) with retract(pose0, l0, dx, dl) = (pose, l)."""
         raise NotImplementedError
 
-    def retract_pose(self, pose: Pose, dx: Pose) -> Pose:
+    def retract_pose(self, pose: Robot, dx: Robot) -> Robot:
         """(3,) pose moved by errors dx (3,), which no landmark changes."""
         ground = self._ground(pose)
         return self.retract(pose, ground, dx, ground)[0]
 
-    def local_pose(self, pose0: Pose, pose: Pose) -> Pose:
+    def local_pose(self, pose0: Robot, pose: Robot) -> Robot:
         """The errors dx (3,) with retract_pose(pose0, dx) = pose."""
         ground = self._ground(pose)
         return self.local(pose0, ground, pose, ground)[0]
 
-    def pose_basis(self, pose: Pose) -> Float[Array, "3 3"]:
+    def pose_basis(self, pose: Robot) -> Float[Array, "R R"]:
         """The derivative of `retract_pose` at zero, of a chart with a `basis`."""
         basis: Basis = self.basis(pose, self._ground(pose))
         return basis.pose
 
-    def _ground(self, pose: Pose) -> Array:
+    def _ground(self, pose: Robot) -> Array:
         """A landmark of zeros."""
         size = 2 if self.landmark_size is None else self.landmark_size
         return jnp.zeros(size, pose.dtype)
@@ -400,10 +459,10 @@ class LinearizationPoint(NamedTuple):
     joint: Joint
     """the filter's state; `joint.lin` is the memory of the linearizer"""
     chart: Chart
-    pose: Float[Array, "3"]
-    """estimate of the robot"""
+    pose: Float[Array, "R"]
+    """estimate of the robot: R = 3, its pose, or the R = 3 + E numbers of `Motion.state`"""
     cov: Array
-    """P in the chart: of the robot (3, 3); for `observe` of robot and landmark (3+L, 3+L), or of
+    """P in the chart: of the robot (R, R); for `observe` of robot and landmark (R+L, R+L), or of
     the robot alone where the landmark is known without an error"""
     slot: PyTree = None
     """() of the landmark, for `observe`"""
@@ -417,7 +476,8 @@ class Linearizer(Component):
     A subclass is a record (`core.record`) that defines `motion`, `observe` and `invert`.
     First-order linearizers evaluate Jacobians at a point; statistical ones fit over the covariance.
     Each may keep a memory inside the filter's state, `joint.lin`. Derivatives are by the
-    *coordinates* of pose and landmark, whatever the chart.
+    *coordinates* of pose and landmark, whatever the chart. Of a motion model with further numbers
+    in its state, the pose is that of `LinearizationPoint`, and 3 + E takes the place of 3.
     """
 
     euclidean: bool = False
@@ -437,7 +497,7 @@ class Linearizer(Component):
             },
         )
 
-    def init(self, pose: Pose, landmarks: Float[Array, "N L"]) -> PyTree:
+    def init(self, pose: Robot, landmarks: Float[Array, "N L"]) -> PyTree:
         """The first memory, of a start with landmarks (N, L) zeros: arrays of fixed shape."""
         return ()
 
@@ -571,6 +631,10 @@ class Filter(Component):
     """the `LinearizedSteps` of a filter whose steps return the linear system they use."""
     map_size: int | None = None
     """N of a filter in a known map of all landmarks, whose tags are 0 … N-1; None of another."""
+    further: bool = False
+    """whether it estimates further numbers of the robot beside the pose, where `Motion.state` has
+    any; one that does not refuses such a model. `init` then gets robot (3 + E,) and its covariance,
+    and its estimates have `Estimate.further`."""
 
     def __post_init__(self) -> None:
         self._check(
@@ -583,6 +647,18 @@ class Filter(Component):
             },
         )
         self._check_names("controls", "measurements")
+        if not self.further and (beside := self.robot_state[3:]):
+            reason = (
+                f"it estimates a pose alone, and the state of the motion has {', '.join(beside)}"
+            )
+            raise InvalidField("", reason)
+        if isinstance(sensor := getattr(self, "sensor", None), Sensor):
+            require("sensor", sensor, sensor_of_robot(self.robot_state))
+
+    @property
+    def robot_state(self) -> tuple[str, ...]:
+        """What the robot's state holds, with units: the pose, and further numbers."""
+        return getattr(getattr(self, "motion", None), "state", POSE)
 
     @property
     def controls(self) -> tuple[str, ...]:
@@ -601,7 +677,7 @@ class Filter(Component):
         """The measurement slots of each sensor of a suite, in order; () of a single sensor."""
         return getattr(getattr(self, "sensor", None), "places", ())
 
-    def init(self, pose: Pose, pose_cov: Float[Array, "3 3"]) -> PyTree:
+    def init(self, pose: Robot, pose_cov: Float[Array, "R R"]) -> PyTree:
         """The state at the start."""
         raise NotImplementedError
 
@@ -627,6 +703,10 @@ class Wrapper(Filter):
     @property
     def name(self) -> str:  # type: ignore[override]
         return f"{_lower(type(self))} {self.filter.name}"
+
+    @property
+    def robot_state(self) -> tuple[str, ...]:
+        return self.filter.robot_state
 
     @property
     def controls(self) -> tuple[str, ...]:
@@ -656,7 +736,7 @@ class Wrapper(Filter):
     def map_size(self) -> int | None:  # type: ignore[override]
         return self.filter.map_size
 
-    def init(self, pose: Pose, pose_cov: Float[Array, "3 3"]) -> PyTree:
+    def init(self, pose: Robot, pose_cov: Float[Array, "R R"]) -> PyTree:
         return self.filter.init(pose, pose_cov)
 
     def predict(self, state: PyTree, u: Control, key: Array) -> PyTree:

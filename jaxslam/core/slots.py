@@ -33,7 +33,10 @@ __all__ = [
 
 
 class Joint(NamedTuple):
-    """The joint state (Solà (5), (6)); D = 3 + N·L, slot i owns rows 3 + i·L to 3 + (i+1)·L."""
+    """The joint state (Solà (5), (6)); D = R + N·L, slot i owns rows R + i·L to R + (i+1)·L.
+
+    The robot has R = 3 + E numbers, its pose and `further` ones; R = `robot_size`.
+    """
 
     pose: Float[Array, "3"]
     landmarks: Float[Array, "N L"]
@@ -52,32 +55,53 @@ class Joint(NamedTuple):
     a sensor whose landmarks may become points"""
     co_observed: jax.Array | None = None
     """(N, N) bool: pairs of landmarks that one scan measured, of a filter that merges others"""
+    further: jax.Array | None = None
+    """(E,) further numbers of the robot, `Motion.state[3:]`; None where its state is the pose"""
+
+    @property
+    def robot(self) -> Float[Array, "R"]:
+        """The pose and further numbers of the robot."""
+        if self.further is None:
+            return self.pose
+        return jnp.concatenate([self.pose, self.further], axis=-1)
+
+    @property
+    def robot_size(self) -> int:
+        """The number R of the robot's numbers, and so of its rows of P."""
+        return 3 if self.further is None else 3 + self.further.shape[-1]
+
+    def with_robot(self, robot: Float[Array, "R"]) -> "Joint":
+        """The state with these numbers of the robot."""
+        if robot.shape[-1] == 3:
+            return self._replace(pose=robot)
+        return self._replace(pose=robot[..., :3], further=robot[..., 3:])
 
     def __repr__(self) -> str:
         return short_repr(self)
 
 
 def empty(
-    pose: Float[Array, "3"],
-    pose_cov: Float[Array, "3 3"],
+    pose: Float[Array, "R"],
+    pose_cov: Float[Array, "R R"],
     capacity: int,
     landmark_size: int,
     lin: PyTree = (),
     *,
     square_root: bool = False,
 ) -> Joint:
-    """The initial state: a robot and no landmark (Solà (7)); pose_cov (3, 3) may be zero."""
-    size = 3 + capacity * landmark_size
+    """The initial state: a robot and no landmark (Solà (7)); pose_cov (R, R) may be zero."""
+    n = pose.shape[0]
+    size = n + capacity * landmark_size
     if square_root:
         pose_cov = cholesky(pose_cov)[0]
     return Joint(
         pose=pose,
         landmarks=jnp.zeros((capacity, landmark_size), pose.dtype),
-        cov=jnp.eye(size, dtype=pose.dtype).at[:3, :3].set(pose_cov),
+        cov=jnp.eye(size, dtype=pose.dtype).at[:n, :n].set(pose_cov),
         alive=jnp.zeros(capacity, bool),
         tag=jnp.full(capacity, -1, jnp.int32),
         lin=lin,
-    )
+    ).with_robot(pose)
 
 
 def find(
@@ -116,22 +140,23 @@ def gather(joint: Joint, slot: Int[Array, ""]) -> tuple[Float[Array, "L"], Float
     """The landmark (L,) in a slot () and its rows (L, D) of the covariance."""
     size = joint.landmarks.shape[1]
     landmark = jax.lax.dynamic_index_in_dim(joint.landmarks, slot, keepdims=False)
-    return landmark, jax.lax.dynamic_slice_in_dim(joint.cov, 3 + slot * size, size)
+    return landmark, jax.lax.dynamic_slice_in_dim(joint.cov, joint.robot_size + slot * size, size)
 
 
-def robot_cov(joint: Joint, square_root: bool = False) -> Float[Array, "3 3"]:
-    """The covariance of the robot, (3, 3)."""
-    return joint.cov[:3] @ joint.cov[:3].T if square_root else joint.cov[:3, :3]
+def robot_cov(joint: Joint, square_root: bool = False) -> Float[Array, "R R"]:
+    """The covariance of the robot, (R, R)."""
+    n = joint.robot_size
+    return joint.cov[:n] @ joint.cov[:n].T if square_root else joint.cov[:n, :n]
 
 
 def local_cov(joint: Joint, slot: Int[Array, ""], square_root: bool = False) -> Float[Array, "K K"]:
-    """The covariance of the robot and the landmark of a slot (), (3+L, 3+L)."""
-    size = joint.landmarks.shape[1]
-    rows = jnp.concatenate([joint.cov[:3], gather(joint, slot)[1]])
+    """The covariance of the robot and the landmark of a slot (), (R+L, R+L)."""
+    n, size = joint.robot_size, joint.landmarks.shape[1]
+    rows = jnp.concatenate([joint.cov[:n], gather(joint, slot)[1]])
     if square_root:
         return rows @ rows.T
-    landmark = jax.lax.dynamic_slice_in_dim(rows, 3 + slot * size, size, axis=1)
-    return jnp.concatenate([rows[:, :3], landmark], axis=1)
+    landmark = jax.lax.dynamic_slice_in_dim(rows, n + slot * size, size, axis=1)
+    return jnp.concatenate([rows[:, :n], landmark], axis=1)
 
 
 def scatter(
@@ -139,7 +164,7 @@ def scatter(
     slot: Int[Array, "M"],
     granted: Bool[Array, "M"],
     landmarks: Float[Array, "M L"],
-    by_pose: Float[Array, "M L 3"],
+    by_pose: Float[Array, "M L R"],
     own_cov: Float[Array, "M L L"],
     tag: Int[Array, "M"],
     *,
@@ -156,7 +181,7 @@ def scatter(
     Args:
         slot: (m,) dead slots, all different where granted.
         granted: (m,) bool.
-        landmarks, by_pose, own_cov, tag: (m, L), (m, L, 3), (m, L, L), (m,).
+        landmarks, by_pose, own_cov, tag: (m, L), (m, L, R), (m, L, L), (m,).
     """
     m, size = landmarks.shape
     capacity = joint.landmarks.shape[0]
@@ -173,7 +198,7 @@ def scatter(
         mask = born.reshape(-1, *(1,) * (values.ndim - 1))
         return jnp.where(mask, values[place], jnp.zeros_like(values[:1]))
 
-    gain = of_slots(by_pose).reshape(capacity * size, 3)
+    gain = of_slots(by_pose).reshape(capacity * size, joint.robot_size)
     landmark_cov = of_slots(symmetrize(own_cov))
     if square_root:
         landmark_cov = jax.vmap(lambda cov: cholesky(cov)[0])(landmark_cov)
@@ -189,32 +214,34 @@ def scatter(
     )
 
 
-def _half_of(cov: Float[Array, "D D"], gain: Float[Array, "E 3"]) -> Float[Array, "3 D"]:
+def _half_of(cov: Float[Array, "D D"], gain: Float[Array, "E R"]) -> Float[Array, "R D"]:
     """T = R + P_RR Gᵀ/2 of the rows R of the robot, which are zero at the new columns.
 
     G T + (G T)ᵀ is the cross-covariance with the map and, where rows and columns are both new,
     G P_RR Gᵀ; symmetric to the bit.
     """
-    return cov[:3].at[:, 3:].add(0.5 * matmul(cov[:3, :3], gain.T))
+    n = gain.shape[1]
+    return cov[:n].at[:, n:].add(0.5 * matmul(cov[:n, :n], gain.T))
 
 
 def _add_in_one_pass(
     cov: Float[Array, "D D"],
     born: Bool[Array, "N"],
-    gain: Float[Array, "E 3"],
+    gain: Float[Array, "E R"],
     landmark_cov: Float[Array, "N L L"],
     square_root: bool,
 ) -> Float[Array, "D D"]:
     """The covariance with G P and blocks on the diagonal added to the zeros of padding."""
     # Padding's unit variance goes first, to an exact zero: a small covariance plus 1 would lose it.
-    filled = jnp.concatenate([jnp.zeros(3, bool), jnp.repeat(born, landmark_cov.shape[1])])
-    half = cov[:3] if square_root else _half_of(cov, gain)
+    n = gain.shape[1]
+    filled = jnp.concatenate([jnp.zeros(n, bool), jnp.repeat(born, landmark_cov.shape[1])])
+    half = cov[:n] if square_root else _half_of(cov, gain)
     cov = jnp.where(filled[:, None], 0.0, cov)
-    cross = total(gain[:, k, None] * half[k, None, :] for k in range(3))
+    cross = total(gain[:, k, None] * half[k, None, :] for k in range(n))
     if square_root:
-        return _add_blocks(cov.at[3:].add(cross), landmark_cov)
+        return _add_blocks(cov.at[n:].add(cross), landmark_cov)
     # Stored once: XLA would compute it again for its transpose, at each of the D² entries.
-    cross = materialize(jnp.pad(cross, [(3, 0), (0, 0)]))
+    cross = materialize(jnp.pad(cross, [(n, 0), (0, 0)]))
     return _add_blocks(cov + (cross + cross.T), landmark_cov)
 
 
@@ -222,23 +249,23 @@ def _write_in_place(
     cov: Float[Array, "D D"],
     slot: Int[Array, "m"],
     granted: Bool[Array, "m"],
-    gain: Float[Array, "E 3"],
+    gain: Float[Array, "E R"],
     landmark_cov: Float[Array, "N L L"],
     square_root: bool,
 ) -> Float[Array, "D D"]:
     """The covariance of `_add_in_one_pass`, written one new landmark after the other."""
-    size = landmark_cov.shape[1]
+    size, n = landmark_cov.shape[1], gain.shape[1]
     # Before the loop: the rows of the robot change as landmarks are written.
-    half = materialize(cov[:3] if square_root else _half_of(cov, gain))
+    half = materialize(cov[:n] if square_root else _half_of(cov, gain))
 
     def write(cov: jax.Array, slot: jax.Array, granted: jax.Array) -> jax.Array:
-        first = 3 + slot * size
+        first = n + slot * size
         by_pose = jax.lax.dynamic_slice_in_dim(gain, slot * size, size)
-        rows = total(by_pose[:, k, None] * half[k, None, :] for k in range(3))
+        rows = total(by_pose[:, k, None] * half[k, None, :] for k in range(n))
         if not square_root:
             columns = jax.lax.dynamic_slice_in_dim(half, first, size, axis=1)
-            rows = rows.at[:, 3:].add(
-                total(columns[k, :, None] * gain[None, :, k] for k in range(3))
+            rows = rows.at[:, n:].add(
+                total(columns[k, :, None] * gain[None, :, k] for k in range(n))
             )
         block = jax.lax.dynamic_slice_in_dim(rows, first, size, axis=1) + landmark_cov[slot]
         # Stored, since the rows are written twice: as rows, and transposed as columns.
@@ -260,7 +287,8 @@ def _write_in_place(
 def _add_blocks(cov: Float[Array, "D D"], blocks: Float[Array, "N L L"]) -> Float[Array, "D D"]:
     """The covariance with blocks (N, L, L) added on the diagonal of the landmarks."""
     capacity, size = blocks.shape[:2]
-    rows = 3 + jnp.arange(capacity)[:, None] * size + jnp.arange(size)[None, :]
+    first = cov.shape[0] - capacity * size  # R, after the rows of the robot
+    rows = first + jnp.arange(capacity)[:, None] * size + jnp.arange(size)[None, :]
     return cov.at[rows[:, :, None], rows[:, None, :]].add(blocks)
 
 
@@ -278,7 +306,7 @@ def remove(joint: Joint, dead: Array, *, square_root: bool = False) -> Joint:
         reason = f"expected bool of shape {joint.alive.shape}, got {got}"
         raise InvalidField("dead", reason, owner="remove")
     size = joint.landmarks.shape[1]
-    keep = jnp.concatenate([jnp.ones(3, bool), jnp.repeat(~dead, size)])
+    keep = jnp.concatenate([jnp.ones(joint.robot_size, bool), jnp.repeat(~dead, size)])
     eye = jnp.eye(joint.cov.shape[0], dtype=joint.cov.dtype)
     if square_root:
         wide = [jnp.where(keep[:, None], joint.cov, 0.0), jnp.where(keep[:, None], 0.0, eye)]

@@ -11,6 +11,7 @@ from enum import IntEnum
 from typing import NamedTuple, TypeAlias
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, Int, PyTree
@@ -242,11 +243,23 @@ class Truth(NamedTuple):
     """true landmarks, in the order of their tags."""
     missed: Int[JaxOrNumPy, "T"]
     """landmarks in view for which the scan had no free slot."""
-    start: Float[JaxOrNumPy, "3"]
-    """true pose before the first control."""
+    start: Float[JaxOrNumPy, "R"]
+    """true pose before the first control; of a motion model with further numbers in its state, all
+    R = 3 + E."""
     origin: Int[JaxOrNumPy, "T M"] | None = None
     """the tag of the landmark each measurement is truly of, -1 of none; None but in a world with
     `spurious` data."""
+    further: Float[JaxOrNumPy, "T E"] | None = None
+    """the true further numbers of the robot at each scan, `Motion.state[3:]`; None where E = 0."""
+
+    @property
+    def robot(self) -> Float[JaxOrNumPy, "T R"]:
+        """The true pose and further numbers of the robot at each scan, R = 3 + E."""
+        if self.further is None:
+            return self.pose
+        if isinstance(self.pose, np.ndarray) and isinstance(self.further, np.ndarray):
+            return np.concatenate([self.pose, self.further], axis=-1)
+        return jnp.concatenate([jnp.asarray(self.pose), jnp.asarray(self.further)], axis=-1)
 
     def __repr__(self) -> str:
         return short_repr(self)
@@ -264,6 +277,9 @@ class Estimate(NamedTuple):
     alive: Bool[JaxOrNumPy, "N"]
     tag: Int[JaxOrNumPy, "N"]
     """-1 where not alive."""
+    further: Float[JaxOrNumPy, "E"] | None = None
+    """the further numbers of the robot, `Motion.state[3:]`; None where its state is the pose."""
+    further_cov: Float[JaxOrNumPy, "E E"] | None = None
 
     def __repr__(self) -> str:
         return short_repr(self)

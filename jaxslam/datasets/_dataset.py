@@ -63,9 +63,10 @@ class Dataset:
     sensor: Sensor
     tags: tuple[int | str, ...]
     """the names in the file of the landmarks with tags 0, 1, …, N-1"""
-    pose: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
-    """pose of the robot before the first control, the frame of the map"""
-    pose_cov: Float[np.ndarray, "3 3"] = field(default_factory=lambda: np.zeros((3, 3)))
+    pose: Float[np.ndarray, "R"] = field(default_factory=lambda: np.zeros(3))
+    """pose of the robot before the first control, the frame of the map; of a motion with further
+    numbers in its state, all R = 3 + E"""
+    pose_cov: Float[np.ndarray, "R R"] = field(default_factory=lambda: np.zeros((3, 3)))
     """covariance of `pose`; zero if the first pose defines the frame"""
     filter_options: dict[str, Any] = field(default_factory=dict)
     """keyword arguments of `filters.EkfSlam` for this data set (update, gate)"""

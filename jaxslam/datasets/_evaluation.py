@@ -9,6 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, PyTree
 
+from jaxslam.charts import with_further
 from jaxslam.consistency import metrics
 from jaxslam.consistency._intervals import LEVEL, percentage
 from jaxslam.consistency._measures.nees import block_nees, pose_error
@@ -67,9 +68,10 @@ def joint_map_cov(filter: Filter, state: PyTree) -> Float[np.ndarray, "N 2 N 2"]
     """
     if not isinstance(state, Joint) or filter.landmark != _POINT:
         return None
-    cov = np.asarray(_in_coordinates(state, filter.chart, square_root=filter.square_root))
-    count = state.landmarks.shape[0]
-    return cov[3:, 3:].reshape(count, 2, count, 2)
+    chart = with_further(filter.chart, filter.robot_state)
+    cov = np.asarray(_in_coordinates(state, chart, square_root=filter.square_root))
+    count, n = state.landmarks.shape[0], state.robot_size
+    return cov[n:, n:].reshape(count, 2, count, 2)
 
 
 def judge_map(

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxslam.core._record import check_field, field, record, static
-from jaxslam.core.protocols import Component, Motion, Sensor
+from jaxslam.core.protocols import POSE, Component, Motion, Sensor, motion_of_pose, sensor_of_robot
 from jaxslam.core.validation import InvalidField, instance_of
 from jaxslam.math import _linalg as linalg
 from jaxslam.math import se2
@@ -69,9 +69,6 @@ def _point_rows(z: Array) -> Rows:
 _RELATIVE_POSE = Chordal(_chordal_pose, 4, _pose_rows)
 _RELATIVE_POSITION = Chordal(_chordal_point, 2, _point_rows)
 PRIOR = Chordal(_chordal_prior, 1, None)
-
-
-POSE = ("x [m]", "y [m]", "theta [rad]")
 
 
 class Factor(Component):
@@ -227,7 +224,7 @@ class FromSensor(Factor):
     R(z) prefers measurements that came out small. A row whose R(ẑ) is singular has no weight.
     """
 
-    sensor: Sensor = field(check=instance_of(Sensor))
+    sensor: Sensor = field(check=lambda sensor: sensor_of_robot(POSE)(instance_of(Sensor)(sensor)))
     own_noise: bool = static(default=False, kw_only=True)
     """the information of the table is for R(ẑ)^{-1/2} e, the identity, and not for e"""
 
@@ -277,6 +274,7 @@ class _MotionFactor(Factor):
 
     def __post_init__(self) -> None:
         check_field(self, "motion", instance_of(Motion))
+        check_field(self, "motion", motion_of_pose)
         super().__post_init__()
 
     @property

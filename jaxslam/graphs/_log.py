@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from jaxslam.core._noise import Constant
 from jaxslam.core._numbers import is_concrete
 from jaxslam.core._validation import check_models, log_of
-from jaxslam.core.protocols import Motion, Sensor
+from jaxslam.core.protocols import POSE, Motion, Sensor, motion_of_pose, sensor_of_robot
 from jaxslam.core.types import JaxOrNumPy, Log
 from jaxslam.core.validation import (
     InvalidField,
@@ -87,6 +87,8 @@ def of_log(
     """
     with refusals_of("graphs.of_log"):
         check_models(motion, sensor)
+        require("motion", motion, motion_of_pose)
+        require("sensor", sensor, sensor_of_robot(POSE))
         if isinstance(sensor, Suite) or sensor.reduced is not None:
             reason = f"expected one of landmarks that stay what they are, got {sensor.name}"
             raise InvalidField("sensor", reason)

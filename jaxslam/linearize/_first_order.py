@@ -17,29 +17,29 @@ from jaxslam.math._arrays import (
     Landmark,
     Measurement,
     ObserveJacobians,
-    Pose,
-    PoseMatrix,
+    Robot,
+    RobotMatrix,
     Unmeasured,
 )
 from jaxslam.math._linalg import matmul
 
 
 def motion_jacobians(
-    motion: Motion, pose: Pose, u: Control
-) -> tuple[PoseMatrix, Float[Array, "3 W"]]:
+    motion: Motion, pose: Robot, u: Control
+) -> tuple[RobotMatrix, Float[Array, "R W"]]:
     """The Jacobians F, W of a motion, ∂step/∂pose and ∂step/∂w at w = 0 (Solà (13))."""
     w = jnp.zeros(len(motion.noises), pose.dtype)
     by_pose, by_noise = jax.jacfwd(motion.step, argnums=(0, 2))(pose, u, w)
     return by_pose, by_noise
 
 
-def observe_jacobians(sensor: Sensor, pose: Pose, landmark: Landmark) -> ObserveJacobians:
+def observe_jacobians(sensor: Sensor, pose: Robot, landmark: Landmark) -> ObserveJacobians:
     """The Jacobians H of a measurement, ∂observe/∂pose and ∂observe/∂l (Solà (25))."""
     by_pose, by_landmark = jax.jacfwd(sensor.observe, argnums=(0, 1))(pose, landmark)
     return by_pose, by_landmark
 
 
-def invert_jacobians(sensor: Sensor, pose: Pose, z: Measurement, s: Unmeasured) -> InvertJacobians:
+def invert_jacobians(sensor: Sensor, pose: Robot, z: Measurement, s: Unmeasured) -> InvertJacobians:
     """The Jacobians G of a new landmark by pose, z and s, ∂invert/∂… (Solà (41)-(43))."""
     by_pose, by_z, by_s = jax.jacfwd(sensor.invert, argnums=(0, 1, 2))(pose, z, s)
     return by_pose, by_z, by_s
@@ -59,9 +59,9 @@ def predicted_noise(
 
 
 def motion_at(
-    motion: Motion, pose: Pose, u: Control, at: Pose
-) -> tuple[Pose, PoseMatrix, PoseMatrix]:
-    """The motion f(pose, u, 0), with ∂f/∂pose (3, 3) and W Q Wᵀ (3, 3) taken at another pose."""
+    motion: Motion, pose: Robot, u: Control, at: Robot
+) -> tuple[Robot, RobotMatrix, RobotMatrix]:
+    """The motion f(pose, u, 0), with ∂f/∂pose (R, R) and W Q Wᵀ (R, R) taken at another pose."""
     by_pose, by_noise = motion_jacobians(motion, at, u)
     moved = motion.step(pose, u, jnp.zeros(by_noise.shape[1], pose.dtype))
     # Q is taken at the estimate, also where F and W are taken at another pose.
@@ -70,8 +70,8 @@ def motion_at(
 
 
 def observe_at(
-    sensor: Sensor, point: LinearizationPoint, at_pose: Pose, at_landmark: Landmark
-) -> tuple[Measurement, Float[Array, "Z 3"], Float[Array, "Z L"], Float[Array, "Z Z"]]:
+    sensor: Sensor, point: LinearizationPoint, at_pose: Robot, at_landmark: Landmark
+) -> tuple[Measurement, Float[Array, "Z R"], Float[Array, "Z L"], Float[Array, "Z Z"]]:
     """The measurement h(pose, l), Jacobians at another pose and landmark, and no added noise."""
     by_pose, by_landmark = observe_jacobians(sensor, at_pose, at_landmark)
     expected = sensor.observe(point.pose, point.landmark)
@@ -79,9 +79,9 @@ def observe_at(
 
 
 def invert_at(
-    sensor: Sensor, pose: Pose, z: Measurement, at_pose: Pose, at_z: Measurement
-) -> tuple[Landmark, Float[Array, "L 3"], Float[Array, "L L"]]:
-    """The landmark g(pose, z, s̄), ∂g/∂pose (L, 3) and its covariance; Jacobians at another pose.
+    sensor: Sensor, pose: Robot, z: Measurement, at_pose: Robot, at_z: Measurement
+) -> tuple[Landmark, Float[Array, "L R"], Float[Array, "L L"]]:
+    """The landmark g(pose, z, s̄), ∂g/∂pose (L, R) and its covariance; Jacobians at another pose.
 
     The covariance is G_z R G_zᵀ + G_s S G_sᵀ (L, L), with R at z: Solà (32)-(38), with the prior's
     term of (44).
@@ -93,7 +93,7 @@ def invert_at(
     return sensor.invert(pose, z, mean), by_pose, cov
 
 
-def with_lever_arm(by_pose: Float[Array, "L 3"], offset: Float[Array, "2"]) -> Float[Array, "L 3"]:
+def with_lever_arm(by_pose: Float[Array, "L R"], offset: Float[Array, "2"]) -> Float[Array, "L R"]:
     """The derivative of a point by the pose (·, 3), with an offset (2,) added to the lever arm."""
     # ∂(R a)/∂θ = J R a, J = [0, -1; 1, 0]: linear in the arm.
     return by_pose.at[:2, 2].add(jnp.stack([-offset[1], offset[0]]))

@@ -58,10 +58,12 @@ class AtTruth(Linearizer):
         return first_order.invert_at(sensor, point.pose, z, pose, true_z)
 
     def _pose(self, step: Array, point: LinearizationPoint) -> Array:
-        """The true pose (3,) after a number of steps, in the dtype of the run."""
+        """The true robot (R,) after a number of steps, in the dtype of the run."""
         # Row t of the truth is the pose after motion t + 1; before the first it is the start.
-        after = jnp.asarray(self.truth.pose)[jnp.maximum(step - 1, 0)]
+        after = jnp.asarray(self.truth.robot)[jnp.maximum(step - 1, 0)]
         pose = jnp.where(step > 0, after, jnp.asarray(self.truth.start))
+        if self.truth.further is not None:  # a filter of the pose alone does not use the rest
+            pose = pose[: len(point.pose)]
         return pose.astype(point.pose.dtype)
 
     def _landmark(self, tag: Array, point: LinearizationPoint) -> Array:
@@ -73,7 +75,7 @@ class First(NamedTuple):
     """The first estimates of the pose and the landmarks."""
 
     pose: Array
-    """(3,) of this step, as predicted, before any measurement of it"""
+    """(R,) of this step, as predicted, before any measurement of it"""
     landmarks: Array
     """(N, L) as they entered the map"""
 
@@ -93,7 +95,10 @@ class FirstEstimate(Linearizer):
     covariance then follows: G_R = [I, J(l̂ - p̂_k)], as the definition has it. The authors' program
     takes the corrected position, from which this differs by up to 0.034 m over 800 steps.
 
-    The process noise is that of the standard EKF. Euclidean chart and point landmarks only.
+    Further numbers of the robot (`Motion.state`) are of the prediction in H, as the pose is, and of
+    the estimate in F; a state that a rotation of the map turns, as a velocity (v_x, v_y) in it,
+    would need more. The process noise is that of the standard EKF. Euclidean chart and point
+    landmarks only.
     """
 
     euclidean = True
@@ -132,7 +137,7 @@ class _Constraint(NamedTuple):
     """The unobservable rotation direction of the linearized system, as lever arms."""
 
     pose: Array
-    """(3,) of this step, as predicted"""
+    """(R,) of this step, as predicted"""
     robot: Array
     """(2,) α [m]: the rotation moves the robot by J α"""
     landmarks: Array

@@ -53,19 +53,19 @@ class Unscented(Linearizer):
     def motion(
         self, motion: Motion, u: Array, point: LinearizationPoint
     ) -> tuple[Array, Array, Array, tuple[()]]:
-        pose, chart, width = point.pose, point.chart, len(motion.noises)
+        pose, chart, width, n = point.pose, point.chart, len(motion.noises), len(point.pose)
         moved = motion.step(pose, u, jnp.zeros(width, pose.dtype))
         root = _root(point.cov)
         root_noise = linalg.root_psd(motion.noise_cov(pose, u))
 
         def f(xi: Array) -> Array:
-            start = chart.retract_pose(pose, xi[:3])
-            return chart.local_pose(moved, motion.step(start, u, xi[3:]))
+            start = chart.retract_pose(pose, xi[:n])
+            return chart.local_pose(moved, motion.step(start, u, xi[n:]))
 
         # The noise of the motion is independent of the error of the pose.
         fit = self._fit(f, jax.scipy.linalg.block_diag(root, root_noise))
-        by_pose = by_variables(fit.slope[:, :3], root)
-        noise = linalg.matmul(fit.slope[:, 3:], fit.slope[:, 3:].T) + fit.rest
+        by_pose = by_variables(fit.slope[:, :n], root)
+        noise = linalg.matmul(fit.slope[:, n:], fit.slope[:, n:].T) + fit.rest
         if chart.basis is not None:
             # From errors in the chart to differences of coordinates, after and before the motion.
             basis = chart.pose_basis(moved)
@@ -76,21 +76,21 @@ class Unscented(Linearizer):
     def observe(
         self, sensor: Sensor, point: LinearizationPoint
     ) -> tuple[Array, Array, Array, Array]:
-        pose, landmark, chart = point.pose, point.landmark, point.chart
+        pose, landmark, chart, n = point.pose, point.landmark, point.chart, len(point.pose)
         root = _root(point.cov)
         centre = sensor.observe(pose, landmark)
-        is_known = len(point.cov) == 3  # P is that of the robot alone
+        is_known = len(point.cov) == n  # P is that of the robot alone
 
         def h(xi: Array) -> Array:
             if is_known:
                 seen_from, seen = chart.retract_pose(pose, xi), landmark
             else:
-                seen_from, seen = chart.retract(pose, landmark, xi[:3], xi[3:])
+                seen_from, seen = chart.retract(pose, landmark, xi[:n], xi[n:])
             return sensor.residual(sensor.observe(seen_from, seen), centre)
 
         fit = self._fit(h, root)
         slope = by_variables(fit.slope, root)
-        by_pose, by_landmark = slope[:, :3], slope[:, 3:]
+        by_pose, by_landmark = slope[:, :n], slope[:, n:]
         if is_known:
             by_landmark = jnp.zeros((len(centre), len(landmark)), centre.dtype)
         if chart.basis is not None and is_known:
@@ -106,7 +106,7 @@ class Unscented(Linearizer):
     def invert(
         self, sensor: Sensor, z: Array, tag: Array, point: LinearizationPoint
     ) -> tuple[Array, Array, Array]:
-        pose, chart, size_z = point.pose, point.chart, z.shape[0]
+        pose, chart, n, seen = point.pose, point.chart, len(point.pose), len(point.pose) + len(z)
         mean, cov_s = (jnp.asarray(part, z.dtype) for part in sensor.free)
         centre = sensor.invert(pose, z, mean)
         zero = jnp.zeros_like(centre)
@@ -115,13 +115,13 @@ class Unscented(Linearizer):
 
         def g(xi: Array) -> Array:
             # Only the pose is perturbed; there is no landmark yet.
-            start, _ = chart.retract(pose, zero, xi[:3], zero)
-            landmark = sensor.invert(start, z + xi[3 : 3 + size_z], mean + xi[3 + size_z :])
+            start, _ = chart.retract(pose, zero, xi[:n], zero)
+            landmark = sensor.invert(start, z + xi[n:seen], mean + xi[seen:])
             return chart.local(pose, centre, start, landmark)[1]
 
         fit = self._fit(g, jax.scipy.linalg.block_diag(root, *noise_roots))
-        by_pose = by_variables(fit.slope[:, :3], root)
-        cov = linalg.matmul(fit.slope[:, 3:], fit.slope[:, 3:].T) + fit.rest
+        by_pose = by_variables(fit.slope[:, :n], root)
+        cov = linalg.matmul(fit.slope[:, n:], fit.slope[:, n:].T) + fit.rest
         if chart.basis is not None:
             basis = chart.basis(pose, centre)
             if basis.landmark is not None:

@@ -23,24 +23,28 @@ Pose = Float[Array, "3"]
 """(x, y, θ) [m, m, rad]; θ in (-π, π] where a pose is returned"""
 Point = Float[Array, "2"]
 """(x, y) [m], or (range, bearing) [m, rad] where polar"""
+Robot = Float[Array, "R"]
+"""a pose, or a pose and the further numbers that follow it; R = 3 + E"""
 PoseMatrix = Float[Array, "3 3"]
 """by the coordinates of a pose: a covariance, or a Jacobian"""
 PointMatrix = Float[Array, "2 2"]
 PointByPose = Float[Array, "2 3"]
 
+RobotMatrix = Float[Array, "R R"]
+
 Control = Float[Array, "U"]
 ProcessNoise = Float[Array, "W"]
 ProcessNoiseCov = Float[Array, "W W"]
-StepJacobians = tuple[PoseMatrix, Float[Array, "3 U"], Float[Array, "3 W"]]
-"""∂pose'/∂(pose, u, w)"""
+StepJacobians = tuple[Float[Array, "R R"], Float[Array, "R U"], Float[Array, "R W"]]
+"""∂robot'/∂(robot, u, w)"""
 
 Landmark = Float[Array, "L"]
 Measurement = Float[Array, "Z"]
 Unmeasured = Float[Array, "K"]
 """landmark parameters that the measurement does not determine"""
-ObserveJacobians = tuple[Float[Array, "Z 3"], Float[Array, "Z L"]]
+ObserveJacobians = tuple[Float[Array, "Z R"], Float[Array, "Z L"]]
 """∂z/∂(pose, l)"""
-InvertJacobians = tuple[Float[Array, "L 3"], Float[Array, "L Z"], Float[Array, "L K"]]
+InvertJacobians = tuple[Float[Array, "L R"], Float[Array, "L Z"], Float[Array, "L K"]]
 """∂l/∂(pose, z, s)"""
 
 

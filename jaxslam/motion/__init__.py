@@ -6,6 +6,9 @@ from jaxslam._public import publish
 from jaxslam.core._names import Named
 from jaxslam.core.protocols import Motion
 from jaxslam.motion._ackermann import Ackermann
+from jaxslam.motion._augmented import Augmented
+from jaxslam.motion._biased_odometry import BiasedOdometry
+from jaxslam.motion._constant_velocity import ConstantVelocity, NoiseDensity
 from jaxslam.motion._increments import Increment, PoseIncrement
 from jaxslam.motion._odometry import Odometry, OdometryNoise, odometry_control, odometry_controls
 from jaxslam.motion._odometry_errors import Corrected
@@ -16,6 +19,8 @@ from jaxslam.motion._velocity import Velocity, VelocityNoise
 REGISTRY: dict[str, Callable[..., Motion]] = Named(
     {
         "ackermann": Ackermann,
+        "biased_odometry": BiasedOdometry,
+        "constant_velocity": ConstantVelocity,
         "increment": Increment,
         "odometry": Odometry,
         "pose_increment": PoseIncrement,
@@ -27,8 +32,12 @@ REGISTRY: dict[str, Callable[..., Motion]] = Named(
 __all__ = [
     "REGISTRY",
     "Ackermann",
+    "Augmented",
+    "BiasedOdometry",
+    "ConstantVelocity",
     "Corrected",
     "Increment",
+    "NoiseDensity",
     "Odometry",
     "OdometryNoise",
     "PoseIncrement",

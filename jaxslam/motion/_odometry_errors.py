@@ -8,7 +8,7 @@ from jaxslam.core._record import field, record
 from jaxslam.core.protocols import Motion
 from jaxslam.core.validation import instance_of
 from jaxslam.math import se2
-from jaxslam.math._arrays import Control, Pose, ProcessNoise
+from jaxslam.math._arrays import Control, ProcessNoise, Robot
 
 _TRAVEL, _ACROSS, _TURN = ("v", "forward"), ("left",), ("omega", "turn")
 """Names of the controls, velocities or increments, that are corrected."""
@@ -62,6 +62,10 @@ class Corrected(Motion):
         return self.motion.name
 
     @property
+    def state(self) -> tuple[str, ...]:  # type: ignore[override]
+        return self.motion.state
+
+    @property
     def controls(self) -> tuple[str, ...]:  # type: ignore[override]
         return self.motion.controls
 
@@ -89,12 +93,12 @@ class Corrected(Motion):
             ]
         )
 
-    def step(self, pose: Pose, u: Control, w: ProcessNoise) -> Pose:
+    def step(self, pose: Robot, u: Control, w: ProcessNoise) -> Robot:
         # Into the direction in which the robot drives, and back to its axes.
         moved = self.motion.step(self._turn_pose(pose, 1.0), self.control(u), w)
         return self._turn_pose(moved, -1.0)
 
-    def noise_cov(self, pose: Pose, u: Control) -> Array:
+    def noise_cov(self, pose: Robot, u: Control) -> Array:
         cov: Array = self.motion.noise_cov(self._turn_pose(pose, 1.0), self.control(u))
         return cov
 
@@ -111,6 +115,9 @@ class Corrected(Motion):
                 corrected[k] = scale[0] * u[k]
         return jnp.stack(corrected)
 
-    def _turn_pose(self, pose: Pose, sign: float) -> Pose:
+    def _turn_pose(self, pose: Robot, sign: float) -> Robot:
         heading = sign * jnp.asarray(self.heading, pose.dtype)
-        return se2.compose(pose, jnp.stack([0.0 * heading, 0.0 * heading, heading]))
+        turn = jnp.stack([0.0 * heading, 0.0 * heading, heading])
+        if len(pose) == 3:
+            return se2.compose(pose, turn)
+        return jnp.concatenate([se2.compose(pose[:3], turn), pose[3:]])

@@ -9,7 +9,7 @@ from jax import Array
 from jaxslam.core._record import field, record, static
 from jaxslam.core.protocols import Motion
 from jaxslam.core.validation import at_least, instance_of
-from jaxslam.math._arrays import Control, Pose, ProcessNoise, StepJacobians
+from jaxslam.math._arrays import Control, ProcessNoise, Robot, StepJacobians
 
 _Rows = tuple[Array, Array]
 _Jacobians = tuple[Array, Array, Array]
@@ -48,6 +48,10 @@ class Substeps(Motion):
         return self.motion.equations
 
     @property
+    def state(self) -> tuple[str, ...]:  # type: ignore[override]
+        return self.motion.state
+
+    @property
     def controls(self) -> tuple[str, ...]:  # type: ignore[override]
         return _number_names(self.motion.controls, self.count)
 
@@ -55,16 +59,16 @@ class Substeps(Motion):
     def noises(self) -> tuple[str, ...]:  # type: ignore[override]
         return _number_names(self.motion.noises, self.count)
 
-    def step(self, pose: Pose, u: Control, w: ProcessNoise) -> Pose:
-        def substep(pose: Pose, row: _Rows) -> tuple[Array, None]:
+    def step(self, pose: Robot, u: Control, w: ProcessNoise) -> Robot:
+        def substep(pose: Robot, row: _Rows) -> tuple[Array, None]:
             return self.motion.step(pose, *row), None
 
         return jax.lax.scan(substep, pose, self._rows(u, w))[0]
 
-    def noise_cov(self, pose: Pose, u: Control) -> Array:
+    def noise_cov(self, pose: Robot, u: Control) -> Array:
         size = self.count * len(self.motion.noises)
 
-        def substep(pose: Pose, row: _Rows) -> _Rows:
+        def substep(pose: Robot, row: _Rows) -> _Rows:
             u_k, no_noise = row
             return self.motion.step(pose, u_k, no_noise), self.motion.noise_cov(pose, u_k)
 
@@ -88,8 +92,8 @@ class Substeps(Motion):
         perturbed: Array = jax.vmap(self.motion.perturb)(*self._rows(u, w))
         return perturbed.ravel()
 
-    def _jacobians(self, pose: Pose, u: Control, w: ProcessNoise) -> StepJacobians:
-        def forward(pose: Pose, row: _Rows) -> tuple[Array, _Jacobians]:
+    def _jacobians(self, pose: Robot, u: Control, w: ProcessNoise) -> StepJacobians:
+        def forward(pose: Robot, row: _Rows) -> tuple[Array, _Jacobians]:
             return self.motion.step(pose, *row), self.motion.jacobians(pose, *row)
 
         def backward(after: Array, step: _Jacobians) -> tuple[Array, _Rows]:
@@ -97,7 +101,7 @@ class Substeps(Motion):
             return after @ by_pose, (after @ by_u, after @ by_w)  # after is F_n ⋯ F_{k+1}
 
         _, along = jax.lax.scan(forward, pose, self._rows(u, w))
-        identity = jnp.eye(3, dtype=pose.dtype)
+        identity = jnp.eye(len(pose), dtype=pose.dtype)
         by_pose, (by_u, by_w) = jax.lax.scan(backward, identity, along, reverse=True)
         return by_pose, jnp.concatenate(by_u, axis=1), jnp.concatenate(by_w, axis=1)
 

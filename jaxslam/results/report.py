@@ -10,14 +10,26 @@ from jaxslam.results._files import csv_text
 __all__ = ["innovations_csv", "map_csv", "trajectory_csv", "trajectory_tum"]
 
 
-def trajectory_csv(time: np.ndarray, estimate: Estimate) -> str:
-    """A path as CSV: per step time, pose and the upper triangle of its covariance."""
+def trajectory_csv(time: np.ndarray, estimate: Estimate, further: Sequence[str] = ()) -> str:
+    """A path as CSV: per step time, pose and the upper triangle of its covariance.
+
+    further: the names of the robot's further numbers (`Motion.state[3:]`), which follow, and then
+    the upper triangle of theirs.
+    """
     header = ["time", "x", "y", "theta", "c_xx", "c_xy", "c_xt", "c_yy", "c_yt", "c_tt"]
     rows, columns = np.triu_indices(3)
     triangle = np.asarray(estimate.pose_cov)[:, rows, columns]
     values = np.concatenate(
         [np.asarray(time)[:, None], np.asarray(estimate.pose), triangle], axis=1
     )
+    if further:
+        labels = [name.partition("[")[0].strip().replace(" ", "_") for name in further]
+        rows, columns = np.triu_indices(len(labels))
+        header += labels + [
+            f"c_{labels[i]}_{labels[j]}" for i, j in zip(rows, columns, strict=True)
+        ]
+        triangle = np.asarray(estimate.further_cov)[:, rows, columns]
+        values = np.concatenate([values, np.asarray(estimate.further), triangle], axis=1)
     # 17 digits: a NEES of the file is that of the filter, and time may be an epoch.
     return csv_text(header, [[f"{value:.17g}" for value in row] for row in values])
 

@@ -7,13 +7,14 @@ from collections.abc import Callable
 from jaxslam._public import publish
 from jaxslam.core._names import Named
 from jaxslam.core.protocols import Sensor
-from jaxslam.sensors._absolute import Absolute, Compass, PositionFix
+from jaxslam.sensors._absolute import Absolute, Compass, PositionFix, Speed, TurnRate
 from jaxslam.sensors._bearing_inverse_depth import BearingInverseDepth
 from jaxslam.sensors._line import Line
 from jaxslam.sensors._partial import BearingOnly, RangeOnly
 from jaxslam.sensors._range_bearing import RangeBearing, RangeBearingNoise
 from jaxslam.sensors._range_bearing_signature import RangeBearingSignature
 from jaxslam.sensors._range_errors import Corrected
+from jaxslam.sensors._range_rate import RangeRate
 from jaxslam.sensors._relative_position import RelativePosition
 from jaxslam.sensors._suite import Part, Suite
 
@@ -27,7 +28,10 @@ REGISTRY: dict[str, Callable[..., Sensor]] = Named(
         "range_bearing": RangeBearing,
         "range_bearing_signature": RangeBearingSignature,
         "range_only": RangeOnly,
+        "range_rate": RangeRate,
         "relative_position": RelativePosition,
+        "speed": Speed,
+        "turn_rate": TurnRate,
     }
 )
 
@@ -45,8 +49,11 @@ __all__ = [
     "RangeBearingNoise",
     "RangeBearingSignature",
     "RangeOnly",
+    "RangeRate",
     "RelativePosition",
+    "Speed",
     "Suite",
+    "TurnRate",
 ]
 
 publish(__name__)

@@ -1,4 +1,4 @@
-"""Sensors of the robot's state in the map, without a landmark."""
+"""Sensors of the robot's state without a landmark: of its pose in the map, or of its velocities."""
 
 import jax.numpy as jnp
 from numpy.typing import ArrayLike
@@ -13,6 +13,7 @@ from jaxslam.math._arrays import (
     ObserveJacobians,
     Point,
     Pose,
+    Robot,
     Unmeasured,
 )
 
@@ -23,20 +24,20 @@ class Absolute(Sensor):
     landmark = ()
     rows: slice
 
-    def observe(self, pose: Pose, landmark: Landmark) -> Measurement:
+    def observe(self, pose: Robot, landmark: Landmark) -> Measurement:
         return self.frame(pose)[self.rows]
 
-    def observe_jacobians(self, pose: Pose, landmark: Landmark) -> ObserveJacobians:
+    def observe_jacobians(self, pose: Robot, landmark: Landmark) -> ObserveJacobians:
         by_pose = self.frame_jacobian(pose)[self.rows]
         # (Z, 0): there is no landmark to differentiate by.
         return by_pose, by_pose[:, :0]
 
-    def invert(self, pose: Pose, z: Measurement, s: Unmeasured) -> Landmark:
+    def invert(self, pose: Robot, z: Measurement, s: Unmeasured) -> Landmark:
         return jnp.zeros(0, pose.dtype)
 
-    def invert_jacobians(self, pose: Pose, z: Measurement, s: Unmeasured) -> InvertJacobians:
-        none = jnp.zeros((0, 3), pose.dtype)
-        return none, none[:, : len(self.measurements)], none[:, :0]
+    def invert_jacobians(self, pose: Robot, z: Measurement, s: Unmeasured) -> InvertJacobians:
+        none = jnp.zeros((0, len(pose)), pose.dtype)
+        return none, jnp.zeros((0, len(self.measurements)), pose.dtype), none[:, :0]
 
     def position(self, landmark: Landmark) -> Point:
         return jnp.zeros(2, landmark.dtype)
@@ -81,3 +82,45 @@ class PositionFix(Absolute):
     measurements = ("x [m]", "y [m]")
     equations = "x = x_s + n_x\ny = y_s + n_y"
     rows = slice(0, 2)
+
+
+class _OneNumber(Absolute):
+    """An absolute sensor of the one number of the robot that it asks for."""
+
+    def observe(self, pose: Robot, landmark: Landmark) -> Measurement:
+        return pose[3:]
+
+    def observe_jacobians(self, pose: Robot, landmark: Landmark) -> ObserveJacobians:
+        by_robot = jnp.zeros((1, 4), pose.dtype).at[0, 3].set(1)
+        return by_robot, by_robot[:, :0]
+
+
+@record
+class Speed(_OneNumber):
+    """The speedometer, an absolute sensor of the robot's velocity.
+
+    z = (v [m/s]), the number of that name in the state of the motion model, as of
+    `motion.ConstantVelocity`; L = 0.
+    """
+
+    noise_cov: NoiseCov
+    """(1, 1) covariance of z, or a function of z."""
+    measurements = ("v [m/s]",)
+    robot = ("v [m/s]",)
+    equations = "v = v + n_v"
+
+
+@record
+class TurnRate(_OneNumber):
+    """The gyroscope, an absolute sensor of the robot's turn rate.
+
+    z = (omega [rad/s]), the number of that name in the state of the motion model, as of
+    `motion.ConstantVelocity`; L = 0. Of a gyroscope whose bias is to be estimated, and which is
+    part of the odometry, see `motion.BiasedOdometry`.
+    """
+
+    noise_cov: NoiseCov
+    """(1, 1) covariance of z, or a function of z."""
+    measurements = ("omega [rad/s]",)
+    robot = ("omega [rad/s]",)
+    equations = "omega = omega + n_omega"

@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 from jaxslam.core._record import field, record
 from jaxslam.core.protocols import Sensor
 from jaxslam.core.validation import InvalidField, instance_of
-from jaxslam.math._arrays import Landmark, Measurement, Pose, Unmeasured
+from jaxslam.math._arrays import Landmark, Measurement, Robot, Unmeasured
 from jaxslam.sensors._suite import Wrapped
 
 
@@ -55,12 +55,12 @@ class Corrected(Wrapped):
             ]
         return "\n".join(lines + unchanged) if self.sensor.equations else ""
 
-    def observe(self, pose: Pose, landmark: Landmark) -> Measurement:
+    def observe(self, pose: Robot, landmark: Landmark) -> Measurement:
         z = self.sensor.observe(pose, landmark)
         scale, offset = self._line(z)
         return z.at[0].set(scale * z[0] + offset)
 
-    def invert(self, pose: Pose, z: Measurement, s: Unmeasured) -> Landmark:
+    def invert(self, pose: Robot, z: Measurement, s: Unmeasured) -> Landmark:
         scale, offset = self._line(z)
         return self.sensor.invert(pose, z.at[0].set((z[0] - offset) / scale), s)
 

@@ -16,7 +16,7 @@ from jaxslam.core._reprs import describe
 from jaxslam.core.protocols import Free, Reduced, Sensor
 from jaxslam.core.types import Scan
 from jaxslam.core.validation import InvalidField, at_least, instance_of, one_of, or_none
-from jaxslam.math._arrays import Landmark, Measurement, Point, Pose, Unmeasured
+from jaxslam.math._arrays import Landmark, Measurement, Point, Pose, Robot, Unmeasured
 
 
 class Wrapped(Sensor):
@@ -41,10 +41,14 @@ class Wrapped(Sensor):
         return self.sensor.landmark
 
     @property
+    def robot(self) -> tuple[str, ...]:  # type: ignore[override]
+        return self.sensor.robot
+
+    @property
     def free(self) -> Free:  # type: ignore[override]
         return self.sensor.free
 
-    def observe(self, pose: Pose, landmark: Landmark) -> Measurement:
+    def observe(self, pose: Robot, landmark: Landmark) -> Measurement:
         return self.sensor.observe(pose, landmark)
 
     def residual(self, z: Measurement, z_hat: Measurement) -> Measurement:
@@ -54,7 +58,7 @@ class Wrapped(Sensor):
         cov: Array = self.sensor.noise_cov(z)
         return cov
 
-    def invert(self, pose: Pose, z: Measurement, s: Unmeasured) -> Landmark:
+    def invert(self, pose: Robot, z: Measurement, s: Unmeasured) -> Landmark:
         return self.sensor.invert(pose, z, s)
 
     def position(self, landmark: Landmark) -> Point:
@@ -170,6 +174,10 @@ class Suite(Sensor):
         return self.first.landmark
 
     @property
+    def robot(self) -> tuple[str, ...]:  # type: ignore[override]
+        return tuple(dict.fromkeys(name for part in self.parts for name in part.sensor.robot))
+
+    @property
     def carry(self) -> Callable[[Array, Array], Array] | None:
         carry: Callable[[Array, Array], Array] | None = self.first.carry
         return carry
@@ -195,7 +203,7 @@ class Suite(Sensor):
     def embed(self, pose: Pose, point: Point) -> Landmark:
         return self.first.embed(pose, point)
 
-    def observe(self, pose: Pose, landmark: Landmark) -> Measurement:
+    def observe(self, pose: Robot, landmark: Landmark) -> Measurement:
         reason = "a suite has no model of its own: call those of its parts"
         raise InvalidField("", reason, owner=type(self).__name__)
 
@@ -206,7 +214,7 @@ class Suite(Sensor):
     def noise_cov(self, z: Measurement) -> Array:
         return self.observe(z, z)
 
-    def invert(self, pose: Pose, z: Measurement, s: Unmeasured) -> Landmark:
+    def invert(self, pose: Robot, z: Measurement, s: Unmeasured) -> Landmark:
         return self.observe(pose, z)
 
 
@@ -232,6 +240,72 @@ def split_scan(scan: Scan, places: Sequence[int]) -> list[Scan]:
 def on_ground(sensor: Sensor, size: int) -> Sensor:
     """The sensor for landmarks of `size` numbers, of which it uses the first."""
     return sensor if len(sensor.landmark) == size else _OnGround(sensor, size)
+
+
+def of_robot(sensor: Sensor, state: tuple[str, ...]) -> Sensor:
+    """The sensor for a robot of these numbers (`Motion.state`), of which it uses what it asks for.
+
+    The same where the state is a pose. Precondition: the state has what it asks for.
+    """
+    if len(state) == 3:
+        return sensor
+    return _OfRobot(sensor, tuple(state.index(name) for name in sensor.robot), state)
+
+
+@record
+class _OfRobot(Wrapped):
+    """A sensor of a robot (R,) with more numbers than it uses: the pose, and those of an index."""
+
+    sensor: Sensor
+    index: tuple[int, ...] = static()
+    state: tuple[str, ...] = static()
+
+    @property
+    def absolute(self) -> bool:
+        return self.sensor.absolute
+
+    @property
+    def carry(self) -> Callable[[Array, Array], Array] | None:
+        carry: Callable[[Array, Array], Array] | None = self.sensor.carry
+        return carry
+
+    @property
+    def reduced(self) -> Reduced | None:  # type: ignore[override]
+        reduced = self.sensor.reduced
+        if reduced is None:
+            return None
+        return reduced._replace(sensor=of_robot(reduced.sensor, self.state))
+
+    def observe(self, pose: Robot, landmark: Landmark) -> Measurement:
+        return self.sensor.observe(self._own(pose), landmark)
+
+    def invert(self, pose: Robot, z: Measurement, s: Unmeasured) -> Landmark:
+        return self.sensor.invert(self._own(pose), z, s)
+
+    def _own(self, robot: Robot) -> Array:
+        if not self.index:
+            return robot[:3]
+        return jnp.concatenate([robot[:3], *[robot[i : i + 1] for i in self.index]])
+
+
+def conditioned(sensor: Sensor, further: Array) -> Sensor:
+    """The sensor of a pose alone, where the k numbers of the robot that it asks for are known."""
+    return _Conditioned(sensor, further)
+
+
+@record
+class _Conditioned(Wrapped):
+    """A sensor with the numbers (k,) of the robot that it asks for beside the pose."""
+
+    sensor: Sensor
+    further: Array
+    robot = ()
+
+    def observe(self, pose: Pose, landmark: Landmark) -> Measurement:
+        return self.sensor.observe(jnp.concatenate([pose, self.further]), landmark)
+
+    def invert(self, pose: Pose, z: Measurement, s: Unmeasured) -> Landmark:
+        return self.sensor.invert(jnp.concatenate([pose, self.further]), z, s)
 
 
 @record
@@ -263,10 +337,10 @@ class _OnGround(Wrapped):
         cov = jnp.eye(kept + spare, dtype=mean.dtype).at[:kept, :kept].set(prior.cov)
         return Free(jnp.concatenate([mean, jnp.zeros(spare, mean.dtype)]), cov)
 
-    def observe(self, pose: Pose, landmark: Landmark) -> Measurement:
+    def observe(self, pose: Robot, landmark: Landmark) -> Measurement:
         return self.sensor.observe(pose, self._own(landmark))
 
-    def invert(self, pose: Pose, z: Measurement, s: Unmeasured) -> Landmark:
+    def invert(self, pose: Robot, z: Measurement, s: Unmeasured) -> Landmark:
         kept = self.sensor.free.mean.shape[0]
         return jnp.concatenate([self.sensor.invert(pose, z, s[:kept]), s[kept:]])
 

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from jaxslam.core._numbers import is_whole
 from jaxslam.core._record import field, record, static
 from jaxslam.core._reprs import describe
-from jaxslam.core.protocols import Motion
+from jaxslam.core.protocols import Motion, motion_of_pose
 from jaxslam.core.validation import InvalidField, covariance, finite, instance_of, or_none
 from jaxslam.math._arrays import Control, Pose, ProcessNoise
 from jaxslam.sensors._suite import Part, Suite
@@ -27,7 +27,7 @@ def _check_start(value: tuple[ArrayLike, ArrayLike]) -> tuple[ArrayLike, ArrayLi
 class Robot:
     """One robot of a team. Raises ValueError on sensors without a suite, or an invalid start."""
 
-    motion: Motion = field(check=instance_of(Motion))
+    motion: Motion = field(check=lambda motion: motion_of_pose(instance_of(Motion)(motion)))
     sensors: Suite = field(check=instance_of(Suite))
     """a suite, also of a single sensor"""
     start: tuple[ArrayLike, ArrayLike] | None = field(default=None, check=or_none(_check_start))

@@ -14,7 +14,7 @@ from jaxslam.core.types import Scan
 from jaxslam.core.validation import InvalidField
 from jaxslam.math._arrays import Landmark, Number, Pose
 from jaxslam.math._linalg import root_psd
-from jaxslam.sensors._suite import Part
+from jaxslam.sensors._suite import Part, of_robot
 
 Visible = Callable[[jax.Array, jax.Array], jax.Array]
 """(pose, l) -> () bool: whether a sensor reports the landmark from there."""
@@ -53,20 +53,21 @@ def sensor_scans(
     sensor: Sensor,
     visible: Visible,
     places: int,
-    poses: Float[Array, "T 3"],
+    poses: Float[Array, "T R"],
     targets: Float[Array, "*time C L"],
     on: Bool[Array, "T"] | None,
     key: Array,
 ) -> tuple[Scan, Int[Array, "T"]]:
     """The scans (T, …) of one sensor, and how many targets in view had no measurement slot.
 
-    targets: (C, L), or (T, C, L) where they move; tags are their rows. on: when the sensor
-    measures, None for always.
+    poses: with the further numbers of the robot that the sensor takes. targets: (C, L), or
+    (T, C, L) where they move; tags are their rows. on: when the sensor measures, None for always.
     """
     count = targets.shape[-2]
     places = min(places, count)
     by_time = None if targets.ndim == 2 else 0
-    seen = jax.vmap(jax.vmap(visible, (None, 0)), (0, by_time))(poses, targets)
+    viewpoints = poses if poses.shape[1] == 3 else poses[:, :3]
+    seen = jax.vmap(jax.vmap(visible, (None, 0)), (0, by_time))(viewpoints, targets)
     if seen.shape != (len(poses), count) or seen.dtype != bool:
         got = f"{seen.dtype} of shape {seen.shape[2:]}"
         raise InvalidField("visible", f"expected a bool for each pose and landmark, got {got}")
@@ -95,28 +96,31 @@ def sensor_scans(
 
 def part_scan(
     part: Part,
+    state: tuple[str, ...],
     visible: Visible,
-    poses: Float[Array, "T 3"],
+    poses: Float[Array, "T R"],
     targets: Float[Array, "*time C L"],
     tags: Int[Array, "C"],
     key: Array,
 ) -> tuple[Scan, Int[Array, "T"]]:
     """The `sensor_scans` of one part of a suite, in its measurement slots and at its rate.
 
-    tags: of the targets. An absolute sensor has no tag. Without targets nothing is measured.
+    state: what the rows of poses (T, R) hold, as `Motion.state`. tags: of the targets. An absolute
+    sensor has no tag. Without targets nothing is measured.
     """
     step = jnp.arange(poses.shape[0])
     if targets.shape[-2] == 0:
         z = jnp.zeros((len(poses), part.places, len(part.sensor.measurements)), poses.dtype)
         none = jnp.zeros(z.shape[:2], bool)
         return Scan(z, jnp.full(none.shape, -1, jnp.int32), none), jnp.zeros_like(step)
+    sensor = of_robot(part.sensor, state)
     on = (step >= part.start) & ((step - part.start) % part.interval == 0)
     if part.absolute:
         nothing = jnp.zeros((1, 0), poses.dtype)
-        scan, missed = sensor_scans(part.sensor, everywhere, 1, poses, nothing, on, key)
+        scan, missed = sensor_scans(sensor, everywhere, 1, poses, nothing, on, key)
         return scan._replace(tag=jnp.full_like(scan.tag, -1)), missed
     field = visible if part.visible is None else part.visible
-    scan, missed = sensor_scans(part.sensor, field, part.places, poses, targets, on, key)
+    scan, missed = sensor_scans(sensor, field, part.places, poses, targets, on, key)
     tag = jnp.where(scan.valid, tags[jnp.maximum(scan.tag, 0)], -1).astype(jnp.int32)
     spare = part.places - tag.shape[1]
     if spare > 0:  # more slots than there are targets

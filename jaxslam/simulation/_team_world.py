@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from jaxslam._public import publish
 from jaxslam.core._record import FrozenDict, field, function_of, record, set_field, static
-from jaxslam.core.protocols import Motion, Sensor
+from jaxslam.core.protocols import POSE, Motion, Sensor
 from jaxslam.core.types import Log, Scan, Truth
 from jaxslam.core.validation import InvalidField
 from jaxslam.math import se2
@@ -134,7 +134,8 @@ class TeamWorld(World):
             for i, part in enumerate(robot.sensors.parts):
                 part_key = jax.random.fold_in(jax.random.fold_in(key_scan, b), i)
                 field = self.visible
-                scans.append(part_scan(part, field, poses[b], *targets[part.sees], part_key))
+                seen_at = poses[b], *targets[part.sees]
+                scans.append(part_scan(part, POSE, field, *seen_at, part_key))
                 if b == self.report:
                     missed.append(scans[-1][1])
         scan, _ = side_by_side(scans, sizes(robots)[2])

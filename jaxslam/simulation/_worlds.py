@@ -17,7 +17,7 @@ from jaxslam._public import publish
 from jaxslam.core._numbers import as_array, is_concrete
 from jaxslam.core._record import FrozenDict, field, function_of, record, set_field, static
 from jaxslam.core._validation import reworded_tracer_errors
-from jaxslam.core.protocols import Component, Motion, Sensor
+from jaxslam.core.protocols import Component, Motion, Sensor, sensor_of_robot
 from jaxslam.core.types import Log, Scan, Truth
 from jaxslam.core.validation import (
     Check,
@@ -34,7 +34,7 @@ from jaxslam.core.validation import (
 )
 from jaxslam.math._xla import quick_options
 from jaxslam.math.angles import wrap
-from jaxslam.sensors._suite import Suite
+from jaxslam.sensors._suite import Suite, of_robot
 from jaxslam.simulation._scans import (
     Visible,
     draw_gaussian,
@@ -62,9 +62,10 @@ class World(Component):
     controls: ArrayLike
     """(T, U) nominal controls."""
     pose: ArrayLike
-    """(3,) mean of the filter's prior of the pose before the first control."""
+    """(3,) mean of the filter's prior of the pose before the first control; of a motion model with
+    E further numbers in its state, of all R = 3 + E."""
     pose_cov: ArrayLike
-    """(3, 3) covariance of the true start about `pose`, and of that prior."""
+    """(R, R) covariance of the true start about `pose`, and of that prior."""
     places: int | None = None
     """M measurement slots of a scan; None for as many as there are landmarks."""
     spurious: Spurious | None = None
@@ -89,12 +90,13 @@ class World(Component):
         for name, check in {
             "motion": instance_of(Motion),
             "sensor": instance_of(Sensor),
-            "pose": finite(3),
-            "pose_cov": covariance(3),
+            "pose": finite(len(self.motion.state)),
+            "pose_cov": covariance(len(self.motion.state)),
             "filter_options": FrozenDict.of,
             "published": FrozenDict.of,
         }.items():
             self._check_field(name, check)
+        self._check_field("sensor", sensor_of_robot(self.motion.state))
         self._check_field("landmarks", _table_of(self.sensor.landmark))
         self._check_field("controls", _table_of(self.motion.controls))
 
@@ -133,9 +135,10 @@ class Scenario(World):
     controls: ArrayLike = field()
     """(T, U) nominal controls."""
     pose: ArrayLike = (0.0, 0.0, 0.0)
-    """(3,) mean of the filter's prior of the pose before the first control."""
+    """(3,) mean of the filter's prior of the pose before the first control; of a motion model with
+    E further numbers in its state, of all R = 3 + E."""
     pose_cov: ArrayLike = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-    """(3, 3) covariance of the true start about `pose`, and of that prior."""
+    """(R, R) covariance of the true start about `pose`, and of that prior."""
     noise_on: Literal["robot", "odometry"] = static(
         default="robot", check=one_of("robot", "odometry")
     )
@@ -176,25 +179,26 @@ class Scenario(World):
         keys = jax.random.split(key, 3 if self.spurious is None else 4)
         key_motion, key_scan, key_start = keys[:3]
         start = random_pose(jnp.asarray(self.pose, dtype), self.pose_cov, key_start)
-        poses, logged = drive(self.motion, start, controls, key_motion, self.noise_on)
+        robots, logged = drive(self.motion, start, controls, key_motion, self.noise_on)
+        is_pose = len(self.motion.state) == 3
+        poses, further = (robots, None) if is_pose else (robots[:, :3], robots[:, 3:])
         if isinstance(self.sensor, Suite):
-            scan, missed = self._suite_scans(self.sensor, poses, landmarks, key_scan)
-            return Truth(poses, landmarks, missed, start), Log(logged, scan)
+            scan, missed = self._suite_scans(self.sensor, robots, landmarks, key_scan)
+            return Truth(poses, landmarks, missed, start, further=further), Log(logged, scan)
         places = self.places or landmarks.shape[0]
-        scan, missed = sensor_scans(
-            self.sensor, self.visible, places, poses, landmarks, None, key_scan
-        )
-        truth = Truth(poses, landmarks, missed, start)
+        sensor = of_robot(self.sensor, self.motion.state)
+        scan, missed = sensor_scans(sensor, self.visible, places, robots, landmarks, None, key_scan)
+        truth = Truth(poses, landmarks, missed, start, further=further)
         if self.spurious is not None:
-            spoil = partial(self.spurious.spoil, self.sensor)
-            scan, origin = jax.vmap(spoil)(poses, scan, jax.random.split(keys[3], self.steps))
+            spoil = partial(self.spurious.spoil, sensor)
+            scan, origin = jax.vmap(spoil)(robots, scan, jax.random.split(keys[3], self.steps))
             truth = truth._replace(origin=origin)
         return truth, Log(logged, scan)
 
     def _suite_scans(
         self,
         sensors: Suite,
-        poses: Float[Array, "T 3"],
+        poses: Float[Array, "T R"],
         landmarks: Float[Array, "N L"],
         key: Array,
     ) -> tuple[Scan, Int[Array, "T"]]:
@@ -203,7 +207,7 @@ class Scenario(World):
         targets = {"landmarks": (landmarks, tags), "robots": (landmarks[:0], tags[:0])}
         keys = jax.random.split(key, len(sensors.parts))
         scans = [
-            part_scan(part, self.visible, poses, *targets[part.sees], part_key)
+            part_scan(part, self.motion.state, self.visible, poses, *targets[part.sees], part_key)
             for part, part_key in zip(sensors.parts, keys, strict=True)
         ]
         return side_by_side(scans, len(sensors.measurements))
@@ -327,20 +331,20 @@ def with_positions(sensor: Sensor, truth: Truth) -> Truth:
     return truth._replace(landmarks=jax.vmap(sensor.position)(jnp.asarray(truth.landmarks)))
 
 
-def random_pose(pose: Float[Array, "3"], cov: ArrayLike, key: Array) -> Float[Array, "3"]:
-    """A random pose, from the normal distribution of that mean and covariance (3, 3)."""
+def random_pose(pose: Float[Array, "R"], cov: ArrayLike, key: Array) -> Float[Array, "R"]:
+    """A random pose, or robot, from the normal distribution of that mean and covariance (R, R)."""
     start = pose + draw_gaussian(jnp.asarray(cov, pose.dtype), normals_like(key, pose))
     return start.at[2].set(wrap(start[2]))
 
 
 def drive(
     motion: Motion,
-    start: Float[Array, "3"],
+    start: Float[Array, "R"],
     controls: Float[Array, "T U"],
     key: Array,
     noise_on: str = "robot",
-) -> tuple[Float[Array, "T 3"], Float[Array, "T U"]]:
-    """The true poses, and the controls that the robot's log shows."""
+) -> tuple[Float[Array, "T R"], Float[Array, "T U"]]:
+    """The true poses, or robots, and the controls that the robot's log shows."""
     normals = normals_like(key, jnp.zeros((controls.shape[0], len(motion.noises)), controls.dtype))
 
     def step(pose: Array, row: tuple[Array, Array]) -> tuple[Array, tuple[Array, Array]]:

@@ -50,9 +50,10 @@ class Spurious:
         return int(np.ceil(2 * self.clutter))
 
     def spoil(
-        self, sensor: Sensor, pose: Float[Array, "3"], scan: Scan, key: Array
+        self, sensor: Sensor, pose: Float[Array, "R"], scan: Scan, key: Array
     ) -> tuple[Scan, Int[Array, "M"]]:
-        """A scan made at a pose with sensor faults put in, and the true origin of each measurement.
+        """A scan made at a pose, or by a robot (R,), with sensor faults put in, and the true origin
+        of each measurement.
 
         Returns:
             A scan with `places` further slots, clutter last and with tag -1; and the tag
@@ -84,17 +85,18 @@ class Spurious:
         return spoilt, jnp.concatenate([origin, no_tag])
 
     def _false_measurements(
-        self, sensor: Sensor, pose: Float[Array, "3"], count: int, key: Array
+        self, sensor: Sensor, pose: Float[Array, "R"], count: int, key: Array
     ) -> Float[Array, "count Z"]:
         """Measurements of random points around the robot."""
         key_point, key_noise = jax.random.split(key)
+        of_robot = pose if len(pose) == 3 else pose[:3]
         points = jax.random.uniform(
             key_point, (count, 2), pose.dtype, minval=-self.reach, maxval=self.reach
         )
         normals = jax.random.normal(key_noise, (count, len(sensor.measurements)), pose.dtype)
 
         def measure(point: Array, normal: Array) -> Array:
-            exact = sensor.observe(pose, sensor.embed(pose, pose[:2] + point))
+            exact = sensor.observe(pose, sensor.embed(of_robot, pose[:2] + point))
             noisy = exact + root_psd(sensor.noise_cov(exact)) @ normal
             return sensor.residual(noisy, jnp.zeros_like(noisy))
 

@@ -128,9 +128,10 @@ def motion_linearity(
 ) -> Linearity:
     """`linearity_index` of `step` by pose and noise, covariance blockdiag(pose_cov, Q(pose, u))."""
     with refusals_of("motion_linearity"):
-        at = _vector("pose", pose, 3)
+        n = len(motion.state)
+        at = _vector("pose", pose, n)
         control = _vector("u", u, len(motion.controls)).astype(at.dtype)
-        require("pose_cov", pose_cov, covariance(3))
+        require("pose_cov", pose_cov, covariance(n))
     noise = limit_loops(motion.noise_cov)(at, control)
     cov = jax.scipy.linalg.block_diag(jnp.asarray(pose_cov, at.dtype), noise)
     x = jnp.concatenate([at, jnp.zeros(noise.shape[0], at.dtype)])
@@ -138,10 +139,13 @@ def motion_linearity(
     def heading_wrapped(y: jax.Array, y0: jax.Array) -> jax.Array:
         turn = 2 * np.pi
         off = y - y0
-        return off.at[2].add(-turn * jnp.round(off[2] / turn))
+        for k, name in enumerate(motion.state):
+            if name.endswith("[rad]"):
+                off = off.at[k].add(-turn * jnp.round(off[k] / turn))
+        return off
 
     return linearity_index(
-        lambda x: motion.step(x[:3], control, x[3:]),
+        lambda x: motion.step(x[:n], control, x[n:]),
         x,
         cov,
         sigmas=sigmas,
@@ -163,12 +167,13 @@ def sensor_linearity(
     with_noise: whether departures are relative to the sensor's noise, too (R in the index).
     """
     with refusals_of("sensor_linearity"):
-        at = _vector("pose", pose, 3)
+        n = 3 + len(sensor.robot)
+        at = _vector("pose", pose, n)
         point = _vector("landmark", landmark, len(sensor.landmark))
     x = jnp.concatenate([at, point.astype(at.dtype)])
-    noise = sensor.noise_cov(sensor.observe(x[:3], x[3:])) if with_noise else None
+    noise = sensor.noise_cov(sensor.observe(x[:n], x[n:])) if with_noise else None
     return linearity_index(
-        lambda x: sensor.observe(x[:3], x[3:]),
+        lambda x: sensor.observe(x[:n], x[n:]),
         x,
         cov,
         sigmas=sigmas,

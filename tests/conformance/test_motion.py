@@ -18,7 +18,7 @@ from jaxslam.motion import REGISTRY
 
 
 def cases_of(model, hard_angles):
-    """Poses, controls and noises (C, ·): random, hard headings, large coordinates, no motion."""
+    """Robots, controls and noises (C, ·): random, hard headings, large coordinates, no motion."""
     rng = np.random.default_rng(0)
     angles = np.concatenate([rng.uniform(-np.pi, np.pi, 8), hard_angles])
     n = len(angles)
@@ -28,6 +28,8 @@ def cases_of(model, hard_angles):
     u[:: max(1, n // 6)] = 0
     w[:: max(1, n // 3)] = 0
     pose[1:3, :2] *= 1e4
+    further = np.random.default_rng(1).normal(size=(n, len(model.state) - 3))
+    pose = np.concatenate([pose, further], axis=1)
     for k, unit in enumerate(model.controls):
         if unit == "steering [rad]":  # wheels do not turn to the side, noise or not
             u[:, k] = np.clip(u[:, k], -1, 1)
@@ -80,6 +82,7 @@ def assert_stands_still(made, **changes):
     np.testing.assert_allclose(
         np.exp(1j * still[:, 2]), np.exp(1j * made.cases[0][:, 2]), atol=1e-15
     )
+    np.testing.assert_array_equal(still[:, 3:], made.cases[0][:, 3:])
 
 
 def test_record_is_complete(made):
@@ -88,7 +91,7 @@ def test_record_is_complete(made):
     assert type(model) is made.factory
     assert model.controls
     assert model.noises
-    assert all("[" in unit for unit in (*model.controls, *model.noises))
+    assert all("[" in unit for unit in (*model.state, *model.controls, *model.noises))
 
 
 def test_shapes_and_dtypes_and_float32_agrees_with_float64(made):
@@ -102,9 +105,10 @@ def test_shapes_and_dtypes_and_float32_agrees_with_float64(made):
         assert np.all(np.abs(out["step"][:, 2]) <= dtype(np.pi))
         turned = np.exp(1j * out["step"][:, 2]) - np.exp(1j * made.usual["step"][:, 2])
         assert np.abs(turned).max() < 1e-5
-        np.testing.assert_allclose(
-            out["step"][:, :2], made.usual["step"][:, :2], rtol=1e-6, atol=1e-5
-        )
+        for at in (np.s_[:, :2], np.s_[:, 3:]):
+            np.testing.assert_allclose(
+                out["step"][at], made.usual["step"][at], rtol=1e-6, atol=1e-5
+            )
 
 
 def test_noise_moves_the_robot(made):

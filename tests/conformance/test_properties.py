@@ -115,8 +115,11 @@ def angular(names):
 def test_motion_is_the_same_in_every_map_frame(name, carried, pose, data):
     model = MOTIONS[name]
     u, w = data.draw(drawn(model.controls)), data.draw(drawn(model.noises, 0.1))
-    moved = call(model.step, call(se2.compose, carried, pose), u, w)
-    assert_same_pose(moved, call(se2.compose, carried, call(model.step, pose, u, w)), 1e-8)
+    further = data.draw(drawn(model.state[3:])) if model.state[3:] else np.zeros(0)
+    there = np.concatenate([call(se2.compose, carried, pose), further])
+    moved, after = call(model.step, there, u, w), call(model.step, np.r_[pose, further], u, w)
+    assert_same_pose(moved[:3], call(se2.compose, carried, after[:3]), 1e-8)
+    np.testing.assert_array_equal(moved[3:], after[3:])
 
 
 @pytest.mark.parametrize("name", swept(sensors.REGISTRY, "range_bearing", "line"))
@@ -126,8 +129,12 @@ def test_observations_are_the_same_in_every_map_frame(name, carried, pose, offse
     """And what is seen of the robot itself moves with the frame."""
     sensor = SENSORS[name]
     landmark = data.draw(drawn(sensor.landmark))
-    there = call(se2.compose, carried, pose)
+    further = data.draw(drawn(sensor.robot)) if sensor.robot else np.zeros(0)
+    there, pose = np.r_[call(se2.compose, carried, pose), further], np.r_[pose, further]
     seen = angular(sensor.measurements)
+    if sensor.robot and not sensor.landmark:  # a rate, of no frame
+        assert_close(call(sensor.observe, there, landmark), call(sensor.observe, pose, landmark))
+        return
     if not sensor.landmark:
         z = call(sensor.observe, pose, landmark)
         expected = {1: lambda: z + carried[2], 2: lambda: call(se2.from_frame, carried, z)}[

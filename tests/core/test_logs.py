@@ -506,7 +506,7 @@ def test_records_of_arrays_are_shown_by_kind_and_shape():
         "valid=bool[2000,3]))"
     )
     truth = Truth(np.zeros((7, 3)), np.zeros((2, 2)), np.zeros(7, int), np.zeros(3))
-    assert repr(truth).endswith("missed=int64[7], start=float64[3], origin=None)")
+    assert repr(truth).endswith("missed=int64[7], start=float64[3], origin=None, further=None)")
     assert repr(trace).startswith("Trace(2000 steps: 1,999 fused, 1 born,\n")
     assert "pose_cov=float64[2000,3,3]" in repr(trace) and len(repr(trace)) < 800
     assert repr(made_trace(5, runs=(3,))).startswith("Trace(3 × 5 steps: 12 fused, 3 born,")

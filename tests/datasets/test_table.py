@@ -310,7 +310,7 @@ def test_a_file_that_is_missing_or_no_text_is_named(tmp_path, name):
 @pytest.mark.parametrize(
     ("toml", "reason"),
     [
-        ("[motion]\nmodel = 'tank'", "[motion] model: expected one of ackermann, increment, odometry"),
+        ("[motion]\nmodel = 'tank'", "[motion] model: expected one of ackermann, biased_odometry, constant_"),
         ("[sensor]\nmodel = 'eye'", "[sensor] model: expected one of bearing_inverse_depth, bearing"),
         ("[motion]\nnoise = [0.1]", "[motion] noise: expected 2 numbers (v [m/s], omega [rad/s])"),
         ("[motion]\nnoise = [0.1, -1]", "[motion] noise: expected standard deviations >= 0"),

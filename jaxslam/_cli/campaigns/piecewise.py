@@ -27,7 +27,7 @@ class PiecewiseRun(NamedTuple):
     """The results of a filter over a log of T steps, as NumPy arrays."""
 
     path: Estimate
-    """pose (T, 3) and pose_cov (T, 3, 3); the fields of the map are ()"""
+    """pose (T, 3), pose_cov (T, 3, 3), and further states; the fields of the map are ()"""
     status: Int[np.ndarray, "T M"]
     slot: Int[np.ndarray, "T M"]
     nis: Float[np.ndarray, "T M"]
@@ -93,6 +93,7 @@ def run_in_pieces(
             info.dof,
             info.log_likelihood,
             keep(info),
+            (estimate.further, estimate.further_cov),
         )
         return state, (row_results, None if at is None else (estimate, watch(state)))
 
@@ -129,10 +130,11 @@ def run_in_pieces(
         if check is not None:
             checked.append(end)
             passed.append(check(state))
-    pose, cov, status, slot, nis, dof, log_likelihood, kept = jax.tree.map(
+    pose, cov, status, slot, nis, dof, log_likelihood, kept, beside = jax.tree.map(
         lambda *parts: np.concatenate(parts), *pieces
     )
     path = last._replace(pose=pose, pose_cov=cov, points=(), point_covs=(), alive=(), tag=())
+    path = path._replace(further=beside[0], further_cov=beside[1])
     estimates, watched = (
         jax.tree.map(lambda *parts: np.concatenate(parts), *films) if films else (None, None)
     )

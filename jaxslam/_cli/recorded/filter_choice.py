@@ -60,6 +60,8 @@ def chosen_filters(
         sensor=sensor,
         landmarks=np.zeros((data.capacity, len(data.sensor.landmark))),
         controls=data.log.control,
+        pose=data.pose,
+        pose_cov=data.pose_cov,
         places=data.log.scan.tag.shape[1],
         filter_options=data.filter_options,
     )

@@ -51,7 +51,10 @@ def run_filter(
     """
     from jaxslam.results import plot  # matplotlib is slow to load
 
-    pose, pose_cov = np.asarray(data.pose, np.float64), np.asarray(data.pose_cov, np.float64)
+    # Mapping has no further states, whatever the motion's.
+    rows = [data.motion.state.index(name) for name in filter.robot_state]
+    pose = np.asarray(data.pose, np.float64)[rows]
+    pose_cov = np.asarray(data.pose_cov, np.float64)[np.ix_(rows, rows)]
     state = jax.eval_shape(filter.init, pose, pose_cov)
     # The square-root filter holds a factor of P, so its P cannot lose definiteness.
     has_covariance = isinstance(state, Joint) and name != "square_root"

@@ -208,7 +208,7 @@ def _notes(result: DatasetFit) -> list[str]:
             "successive innovations of a landmark are correlated: errors last, so standard errors "
             "are too small"
         )
-    if any(name.startswith(("motion ", "sensor ")) for name in estimate.names):
+    if any(name.startswith(("motion ", "sensor ", "state ")) for name in estimate.names):
         notes.append(
             "NIS / dof is near 1 after any fit of all noises; test them on another log (jaxslam "
             "run)"

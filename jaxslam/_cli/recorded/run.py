@@ -181,7 +181,9 @@ def write_runs(
     files: Files = {}
     for name, run in runs.items():
         suffix = f"-{name}" if len(runs) > 1 else ""
-        files[f"trajectory{suffix}.csv"] = report.trajectory_csv(data.time, run.result.path)
+        further = () if run.result.path.further is None else data.motion.state[3:]
+        path_text = report.trajectory_csv(data.time, run.result.path, further)
+        files[f"trajectory{suffix}.csv"] = path_text
         files[f"trajectory{suffix}.tum"] = report.trajectory_tum(data.time, run.result.path)
         files[f"map{suffix}.csv"] = report.map_csv(run.result.last, data.tags)
         if plan.innovations:
@@ -225,12 +227,13 @@ def _figure(data: Dataset, runs: Mapping[str, FilterRun], formats: tuple[str, ..
         return pose, pose
 
     drive = jax.jit(lambda pose, controls: jax.lax.scan(step, pose, controls)[1])
+    robots = np.asarray(drive(jnp.asarray(data.pose), jnp.asarray(data.log.control)))
     figure = plot.map_figure(
         _path_with_map(first),
         true_points=evaluation.points,
         names=None if evaluation.points is None else data.tags,
         true_path=_true_path(data, evaluation),
-        dead_reckoning=np.asarray(drive(jnp.asarray(data.pose), jnp.asarray(data.log.control))),
+        dead_reckoning=robots[:, :3],
         others={label: _path_with_map(run) for label, run in others},
         title=f"{data.name}: {name} with ellipses" if others else data.name,
     )

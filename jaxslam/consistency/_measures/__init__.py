@@ -9,6 +9,7 @@ from jaxslam.consistency._measures import (
     associations,
     coverage,
     errors,
+    further,
     innovations,
     nees,
     observability,
@@ -59,7 +60,8 @@ def measures_of(names: Iterable[str]) -> list[Measure]:
     So a stored campaign can be read without the file that registered its measures.
     """
     registered = {name for m in REGISTRY.values() for name in (m.key, m.column)}
-    return [*REGISTRY.values(), *(Measure(name, name) for name in names if name not in registered)]
+    others = dict.fromkeys(name for name in names if name not in registered)
+    return [*REGISTRY.values(), *(further.measure_of(n) or Measure(n, n) for n in others)]
 
 
 __all__ = ["Measure", "register"]

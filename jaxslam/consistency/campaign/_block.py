@@ -14,6 +14,7 @@ from jaxtyping import Float, PyTree
 
 from jaxslam.consistency._bound import final_covariance
 from jaxslam.consistency._measures import REGISTRY
+from jaxslam.consistency._measures.further import measures_of_state
 from jaxslam.consistency._measures.measure import RunStatistics
 from jaxslam.consistency._run_scores import score
 from jaxslam.consistency._tally import FAR, condense, condensed_sums
@@ -93,6 +94,7 @@ class BlockRunner:
         self.plan, self._devices = plan, tuple(plan.devices)
         self.programs = programs(self._devices, plan.dtype)
         measures = tuple(m for m in REGISTRY.values() if m.of_run is not None)
+        measures += measures_of_state(plan.scenario.motion.state)
         self._statistics = statistics_program(self._devices, measures)
         # The numbers of world and filters are put on every device once.
         everywhere = NamedSharding(mesh_of(self._devices), spec(None))
@@ -258,7 +260,9 @@ def select_steps(
             info=info._replace(**by_window),
             probe=None if trace.probe is None else trace.probe[at],
         ),
-        truth._replace(pose=truth.pose[at]),
+        truth._replace(
+            pose=truth.pose[at], further=None if truth.further is None else truth.further[at]
+        ),
         statistics._replace(
             landmark_nees=statistics.landmark_nees[at],
             regular_landmarks=statistics.regular_landmarks[at],
@@ -271,7 +275,8 @@ def select_steps(
 
 def rows_of_truth(truth: Truth, rows: slice) -> Truth:
     """The truth of one run at some of its steps."""
-    return truth._replace(pose=truth.pose[rows], missed=truth.missed[rows])
+    further = None if truth.further is None else truth.further[rows]
+    return truth._replace(pose=truth.pose[rows], missed=truth.missed[rows], further=further)
 
 
 def first_run(leaf: jax.Array, axis: int = 0) -> np.ndarray:

@@ -36,7 +36,7 @@ from jaxslam.consistency._measures.measure import Measure, RunStatistics
 from jaxslam.consistency._measures.nees import chart_error_of
 from jaxslam.consistency._measures.observability import monitor_of
 from jaxslam.consistency._run_scores import run_statistics
-from jaxslam.consistency.campaign._candidates import candidate_for, cast_floats, method_of
+from jaxslam.consistency.campaign._candidates import candidate_for, cast_floats, method_of, start_of
 from jaxslam.core.protocols import Candidate, Filter, Sensor
 from jaxslam.core.types import Estimate, Info, Log, Trace, Truth
 from jaxslam.core.validation import require
@@ -171,8 +171,11 @@ def drive_run(
     method, filter_key = method_of(candidate, truth), run_keys(key, number)[1]
     if isinstance(method, Filter):
         require(f"filter {method.name}", method, candidate_for(scenario))
-        chart, start = getattr(method, "chart", Euclidean()), (scenario.pose, scenario.pose_cov)
+        chart, start = getattr(method, "chart", Euclidean()), start_of(method, scenario)
         trace = run(method, log, *start, filter_key, probe=_information_gained)
+        if method.robot_state != scenario.motion.state:  # its further states are not the truth's
+            estimate = trace.estimate._replace(further=None, further_cov=None)
+            trace = trace._replace(estimate=estimate)
     else:
         trace, chart = method(log, filter_key), Euclidean()
     chart_error = chart_error_of(chart, scenario.sensor, trace, truth)

@@ -19,7 +19,7 @@ from jaxslam.core.types import Truth
 from jaxslam.core.validation import Check, InvalidField, covariance, instance_of, require
 from jaxslam.graphs.smoothing._forward_pass import LogEstimator
 from jaxslam.math._definite import is_invertible
-from jaxslam.sensors._suite import Suite
+from jaxslam.sensors._suite import Suite, of_robot
 from jaxslam.simulation._worlds import World
 
 _T = TypeVar("_T")
@@ -112,7 +112,9 @@ def _sensors(scenario: World) -> list[Sensor]:
 def _first_measurement(sensor: Sensor, scenario: World) -> jax.Array:
     """The first landmark as measured from the start, (Z,)."""
     landmark = _number(scenario.landmarks)[0, : len(sensor.landmark)]
-    z: jax.Array = _observe(sensor, _number(scenario.pose), landmark)
+    z: jax.Array = _observe(
+        of_robot(sensor, scenario.motion.state), _number(scenario.pose), landmark
+    )
     return z
 
 
@@ -151,6 +153,15 @@ def candidate_for(scenario: World) -> Check:
     return check
 
 
+def start_of(filter: Filter, scenario: World) -> tuple[ArrayLike, ArrayLike]:
+    """The start of a scenario and its covariance, of the numbers that a filter estimates."""
+    state = scenario.motion.state
+    if filter.robot_state == state:
+        return scenario.pose, scenario.pose_cov
+    rows = np.array([state.index(name) for name in filter.robot_state])
+    return jnp.asarray(scenario.pose)[rows], jnp.asarray(scenario.pose_cov)[rows][:, rows]
+
+
 def _check_sizes(filter: Filter, scenario: World) -> None:
     """Raise ValueError unless a filter takes the controls, measurements and map of a scenario."""
     for field, expected, present in (
@@ -166,6 +177,11 @@ def _check_sizes(filter: Filter, scenario: World) -> None:
                 f"it takes {field} ({', '.join(expected)}), the scenario {scenario.name} gives "
                 f"({', '.join(present)})"
             )
+    if unknown := [name for name in filter.robot_state if name not in scenario.motion.state]:
+        raise ValueError(
+            f"it estimates {', '.join(unknown)}, the state of the scenario {scenario.name} has "
+            f"{', '.join(scenario.motion.state)}"
+        )
     size, count = filter.map_size, np.shape(scenario.landmarks)[0]
     if size is not None and size != count:
         raise ValueError(

@@ -294,11 +294,13 @@ def move_to_start(
     origin = far_origin(scenario.pose, scenario.landmarks)
     if origin is None or (near := move_near_origin(scenario, origin, scenario.controls)) is None:
         return scenario, filters, None
+    is_pose = len(near.motion.state) == 3
     truth = Truth(
-        pose=np.tile(np.asarray(near.pose), (near.steps, 1)),
+        pose=np.tile(np.asarray(near.pose)[:3], (near.steps, 1)),
         landmarks=np.asarray(near.landmarks),
         missed=np.zeros(near.steps, int),
         start=np.asarray(near.pose),
+        further=None if is_pose else np.tile(np.asarray(near.pose)[3:], (near.steps, 1)),
     )
     near_filters: dict[str, Candidate] = {}
     for name, candidate in filters.items():

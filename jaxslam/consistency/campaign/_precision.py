@@ -70,7 +70,7 @@ def _rounding(
     start = np.asarray(scenario.pose, np.float64)[None, :2]
     points = np.asarray(scenario.landmarks, np.float64)[:, :2]
     places = np.concatenate([start, np.pad(points, [(0, 0), (0, 2 - points.shape[1])])])
-    start_cov = np.asarray(scenario.pose_cov, np.float64)[None]
+    start_cov = np.asarray(scenario.pose_cov, np.float64)[None, :3, :3]
     covs = np.concatenate([start_cov, tally.snapshots()[1].reshape(-1, 3, 3)])
     return rounding_of(candidate, dtype, covs, places, least)
 

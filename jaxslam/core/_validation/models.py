@@ -103,9 +103,11 @@ def motion_model(value: object) -> Motion:
         raise ValueError(f"expected a Motion, got the sensor {value.name}: a motion comes first")
     motion: Motion = instance_of(Motion)(value)
     if motion not in _SOUND:
-        pose, u, w = _numbers(3), _numbers(len(motion.controls)), _numbers(len(motion.noises))
-        _check_size(motion, "step", {"pose": pose, "u": u, "w": w}, (3,))
-        _check_size(motion, "noise_cov", {"pose": pose, "u": u}, (len(motion.noises),) * 2)
+        size = len(motion.state)
+        robot = {"pose" if size == 3 else "robot": _numbers(size)}
+        u, w = _numbers(len(motion.controls)), _numbers(len(motion.noises))
+        _check_size(motion, "step", {**robot, "u": u, "w": w}, (size,))
+        _check_size(motion, "noise_cov", {**robot, "u": u}, (len(motion.noises),) * 2)
         _SOUND.add(motion)
     return motion
 
@@ -120,17 +122,18 @@ def sensor_model(value: object) -> Sensor:
     if sensor in _SOUND:
         return sensor
     size_z, size_l = len(sensor.measurements), len(sensor.landmark)
-    pose, z, landmark = _numbers(3), _numbers(size_z), _numbers(size_l)
+    robot = {"robot" if sensor.robot else "pose": _numbers(3 + len(sensor.robot))}
+    z, landmark = _numbers(size_z), _numbers(size_l)
     free = np.shape(sensor.free.mean)
     if len(free) != 1 or np.shape(sensor.free.cov) != free * 2:
         raise ValueError(
             f"expected {sensor.name}.free of shapes (K,) and (K, K), got {free} and "
             f"{np.shape(sensor.free.cov)}",
         )
-    _check_size(sensor, "observe", {"pose": pose, "l": landmark}, (size_z,))
+    _check_size(sensor, "observe", {**robot, "l": landmark}, (size_z,))
     _check_size(sensor, "residual", {"z": z, "z_hat": z}, (size_z,))
     _check_size(sensor, "noise_cov", {"z": z}, (size_z, size_z))
-    _check_size(sensor, "invert", {"pose": pose, "z": z, "s": _numbers(*free)}, (size_l,))
+    _check_size(sensor, "invert", {**robot, "z": z, "s": _numbers(*free)}, (size_l,))
     _check_size(sensor, "position", {"l": landmark}, (2,))
     _SOUND.add(sensor)
     return sensor
@@ -247,6 +250,9 @@ def checked_estimate(estimate: object, dtype: np.dtype) -> Estimate:
         raise InvalidField("", f"expected estimate to return an Estimate, got {got}")
     n = np.shape(estimate.alive)[0] if np.ndim(estimate.alive) == 1 else -1
     shapes = {"pose": (3,), "pose_cov": (3, 3), "points": (n, 2), "point_covs": (n, 2, 2)}
+    if (further := estimate.further) is not None:
+        e = np.shape(further)[-1:]
+        shapes |= {"further": e, "further_cov": e * 2}
     for field, shape in (shapes | {"alive": (n,), "tag": (n,)}).items():
         kind = dtype.type if field in shapes else np.generic
         require(f"Estimate.{field}", getattr(estimate, field), array_of(*shape, kind=kind))

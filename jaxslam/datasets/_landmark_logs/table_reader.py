@@ -432,6 +432,8 @@ def table(folder: str | Path, *, fitted: bool = True) -> Dataset:
             f"{', '.join(sensor.measurements)} alone: a filter starts each landmark from the prior "
             "[sensor] free; --filters localization takes those of landmarks.csv, and needs none"
         )
+    further, further_cov = settings.further_start()
+    apart = np.zeros((3, len(further)))
     unknown = None in (measurements.tags or ())
     capacity = settings.capacity(len(tags), unknown)
     log = Log.from_rows(rows)
@@ -443,8 +445,8 @@ def table(folder: str | Path, *, fitted: bool = True) -> Dataset:
         motion=motion,
         sensor=sensor,
         tags=tags,
-        pose=start,
-        pose_cov=settings.start_cov(),
+        pose=np.concatenate([start, further]),
+        pose_cov=np.block([[settings.start_cov(), apart], [apart.T, further_cov]]),
         filter_options=settings.filter_options(unknown),
         landmarks=None if survey is None else np.array([survey[tag] for tag in tags]),
         true_path=true_path,

@@ -58,6 +58,8 @@ def fitting_model(
 ) -> str:
     """The model whose columns are in the header, by most columns and then by `_DEFAULT_MODELS`."""
     columns_of_file = {split_unit(name)[0] for name in header}
+    # A motion without odometry, whose columns are none, fits any file.
+    registry = {name: factory for name, factory in registry.items() if name != "constant_velocity"}
     fitting, described = [], []
     for name, factory in registry.items():
         model = factory(of_no_noise)
@@ -210,6 +212,8 @@ class _TableNoise:
     """whether the last control is Δt"""
     of_increments: bool = static()
     """whether the covariance grows with Δt, as of increments; else it shrinks, as of velocities"""
+    walks: JaxOrNumPy | None = None
+    """standard deviations, in a second, of the further states whose rates are the last noises"""
 
     def __call__(self, pose: jax.Array, u: jax.Array) -> jax.Array:
         cov = jnp.diag(jnp.asarray(self.deviations, u.dtype) ** 2)
@@ -218,7 +222,11 @@ class _TableNoise:
         if self.per_time:
             moving = u[-1] > 0
             # The inner `where` keeps gradients finite at Δt = 0.
-            return cov * jnp.where(moving, self.interval / jnp.where(moving, u[-1], 1.0), 0.0)
+            per_time = jnp.where(moving, 1 / jnp.where(moving, u[-1], 1.0), 0.0)
+            cov = cov * (self.interval * per_time)
+            if self.walks is not None:
+                walks = jnp.diag(jnp.asarray(self.walks, u.dtype) ** 2) * per_time
+                cov = jax.scipy.linalg.block_diag(cov, walks)
         return cov
 
 
@@ -275,10 +283,11 @@ class TableSettings:
     def __init__(self, path: Path, fitted: bool = True) -> None:
         self.path = path
         self.assumed: list[str] = []
+        self._state_names: tuple[str, ...] = ()
         self._text, self.content = _read(path)
         if not path.exists():
             self.assumed.append(f"no {path.name}")
-        names = ("name", "source", "motion", "sensor", "filter", "calibration")
+        names = ("name", "source", "motion", "sensor", "filter", "calibration", "state")
         self._check_keys("", self.content, names)
         for name in names:
             kind = str if name in ("name", "source") else dict
@@ -287,7 +296,7 @@ class TableSettings:
                 raise ValueError(f"{self._at('', name)}: expected {expected}")
         fit_path = path.with_name(FITTED)
         numbers = _read(fit_path)[1] if fitted else {}
-        for section in sorted(numbers.keys() & {"motion", "sensor", "calibration"}):
+        for section in sorted(numbers.keys() & {"motion", "state", "sensor", "calibration"}):
             if not isinstance(numbers[section], dict):
                 raise ValueError(f"{fit_path}: expected a section [{section}]")
             self.content[section] = self.content.get(section, {}) | numbers[section]
@@ -312,24 +321,99 @@ class TableSettings:
         bare = self._build("motion", factory, options, of_no_noise)
         from_poses = odometry_columns(bare.controls, header) == POSE
         with_interval = INTERVAL in bare.controls
-        count, correctable = len(bare.noises), odometry_errors.can_correct(bare)
-        parameters = self._noise("motion", bare.noises, _MOTION_NOISE)
-        parameters += self._errors("motion", _ODOMETRY_ERRORS if correctable else {}, errors)
+        if len(odometry_columns(bare.controls, header)) == 0:
+            raise ValueError(
+                f"{self._at('motion', 'model')}: expected a model with odometry, got {bare.name}"
+            )
+        correctable = odometry_errors.can_correct(bare)
+        own_states = len(bare.state) - 3  # whose rates are the last noises
+        count = len(bare.noises) - own_states
+        of_errors = self._states(bare, errors, correctable)
+        parameters = self._noise("motion", bare.noises[:count], _MOTION_NOISE)
+        adjustable = {key: row for key, row in _ODOMETRY_ERRORS.items() if key not in of_errors}
+        parameters += self._errors("motion", adjustable if correctable else {}, errors)
+        before_walks = len(parameters)
+        parameters += tuple(
+            Parameter(f"state {name}", value, "noise", ("state", "noise"))
+            for name, value in zip(self._state_names, self._state("noise"), strict=True)
+        )
 
-        # p is the noise (count,), then scale (2,), wheels (2,) and heading if correctable.
+        # p is the noise (count,), then scale (2,), wheels (2,) and heading if correctable and no
+        # state, then the walks of the states.
         def uncorrected(p: JaxOrNumPy) -> Motion:
-            noise = _TableNoise(p[:count], interval, from_poses or with_interval, from_poses)
+            walks = p[before_walks:] if own_states else None
+            noise = _TableNoise(p[:count], interval, from_poses or with_interval, from_poses, walks)
             model = self._build("motion", factory, options, noise)
             return _WithInterval(model, noise) if from_poses else model
 
         def corrected(p: JaxOrNumPy) -> Motion:
             if not correctable:
                 return uncorrected(p)
-            scale, wheels = p[count : count + 2], p[count + 2 : count + 4]
-            return motion.Corrected(uncorrected(p), scale, wheels, p[count + 4])
+            values: dict[str, JaxOrNumPy] = {}
+            at = count
+            for key, (names, neutral) in _ODOMETRY_ERRORS.items():
+                if key in of_errors:
+                    values[key] = np.array(neutral)
+                else:
+                    values[key], at = p[at : at + len(names)], at + len(names)
+            values["heading"] = values["heading"][0]
+            model = motion.Corrected(uncorrected(p), **values)
+            if not of_errors:
+                return model
+            return motion.Augmented(model, of_errors, p[before_walks:])
 
         values = np.array([parameter.value for parameter in parameters])
-        return Parametric(parameters, corrected, (corrected if errors else uncorrected)(values))
+        return Parametric(
+            parameters, corrected, (corrected if errors or of_errors else uncorrected)(values)
+        )
+
+    def _states(
+        self, bare: Motion, errors: Mapping[str, object], correctable: bool
+    ) -> tuple[str, ...]:
+        """The systematic errors that [state] names as further states, and `_state_names` set."""
+        section = self.content.get("state", {})
+        self._check_keys("state", section, ("names", "start", "start_noise", "noise"))
+        of_model = [split_unit(name)[0] for name in bare.state[3:]]
+        names = section.get("names", of_model)
+        possible = of_model or (list(_ODOMETRY_ERRORS) if correctable else [])
+        fit = isinstance(names, list) and all(name in possible for name in names)
+        if (
+            not fit
+            or (of_model and names != of_model)
+            or len(set(names)) < len(names)
+            or (section and not names)
+        ):
+            among = ", ".join(possible) or "none"
+            raise ValueError(
+                f"{self._at('state', 'names')}: expected {'' if of_model else 'some of '}{among}, "
+                f"the states of {bare.name}, got {names!r}"
+            )
+        if of_model:
+            self._state_names = tuple(bare.state[3:])
+            return ()
+        self._state_names = tuple(
+            f"{key} {name}" for key in names for name in _ODOMETRY_ERRORS[key][0]
+        )
+        if stated := [key for key in names if key in errors]:
+            raise ValueError(
+                f"{self._at('motion', stated[0])}: expected none beside [state], whose start it is"
+            )
+        return tuple(names)
+
+    def _state(self, key: str) -> list[float]:
+        """The numbers of a key of [state], one for each further state."""
+        if not self._state_names:
+            return []
+        numbers = self._numbers(
+            "state", key, self.content.get("state", {}).get(key), self._state_names
+        )
+        if key != "start" and min(numbers) < 0:
+            raise ValueError(f"{self._at('state', key)}: expected numbers of at least 0")
+        return numbers
+
+    def further_start(self) -> tuple[np.ndarray, np.ndarray]:
+        """The further states (E,) before the first row, and their covariance (E, E)."""
+        return np.array(self._state("start")), np.diag(np.square(self._state("start_noise")))
 
     def sensor(self, header: Sequence[str]) -> Parametric[Sensor]:
         """The sensor. header: the columns of the measurements."""

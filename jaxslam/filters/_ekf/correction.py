@@ -7,7 +7,8 @@ With the gain K = P Hᵀ S⁻¹ = Vᵀ L⁻¹ this is x ← x ⊞ K ν and P ←
 those before it left. Both compute ν, S and the gate in `_innovate`, and use the sparsity of H,
 which involves the robot and one landmark (`whitening`).
 
-Letters: m measurements, Z numbers in one of them, L in a landmark, D = 3 + N·L of the state.
+Letters: m measurements, Z numbers in one of them, L in a landmark, R in the robot (3, or 3 + E),
+D = R + N·L of the state.
 """
 
 from collections.abc import Callable
@@ -41,7 +42,7 @@ class KalmanFilter(Protocol):
     """The fields of `EkfSlam` that a correction uses."""
 
     @property
-    def chart(self) -> Chart: ...
+    def robot_chart(self) -> Chart: ...
     @property
     def linearize(self) -> Linearizer: ...
     @property
@@ -69,9 +70,9 @@ class Correction(NamedTuple):
     """passed the gate"""
     positive: Bool[Array, "m"]
     """S is positive definite, alone and with the other measurements"""
-    jacobian: Float[Array, "m Z 3+L"]
+    jacobian: Float[Array, "m Z R+L"]
     """H by coordinates"""
-    basis: Float[Array, "m 3+L 3+L"] | None
+    basis: Float[Array, "m R+L R+L"] | None
     """the coordinates by the errors in the chart; None is the identity"""
 
 
@@ -134,8 +135,8 @@ def _correct(
     """The joint corrected at once. gamma: the largest d² that passes the gate, None without one."""
     innovation = _innovate(filter, sensor, joint, slot, z, matched, (joint, slot), gamma)
     cov = _correct_cov(joint.cov, innovation, filter.covariance)
-    pose, landmarks = retract_map(filter.chart, joint, innovation.xi)
-    return joint._replace(pose=pose, landmarks=landmarks, cov=cov), innovation.correction
+    joint = retract_map(filter.robot_chart, joint, innovation.xi)
+    return joint._replace(cov=cov), innovation.correction
 
 
 class _Innovation(NamedTuple):
@@ -175,7 +176,7 @@ def _innovate(
     """The innovation of m measurements at once, from the rows of P that H meets: Solà (26)-(28).
 
         rows of P            H                       H P          S = H P Hᵀ + R
-        robot (3, D)         by pose (m, Z, 3)       (m·Z, D)     (m, Z, m, Z) = L Lᵀ
+        robot (R, D)         by pose (m, Z, R)       (m·Z, D)     (m, Z, m, Z) = L Lᵀ
         landmark (m, L, D)   by landmark (m, Z, L)   V = L⁻¹ H P  ξ = Vᵀ L⁻¹ ν (D,)
 
     Gate, reported numbers and R(ẑ) are those of the first iteration: a later ẑ has moved towards z,
@@ -187,9 +188,9 @@ def _innovate(
     """
     square_root = filter.covariance == "square_root"
     landmark_rows = jax.vmap(slots.gather, in_axes=(None, 0))(joint, slot)[1]
-    # P (m, 3+L, 3+L) of the robot and the landmark of each measurement.
+    # P (m, R+L, R+L) of the robot and the landmark of each measurement.
     local_cov = jax.vmap(partial(slots.local_cov, joint, square_root=square_root))(slot)
-    m, size_z = z.shape
+    (m, size_z), n = z.shape, joint.robot_size
     diagonal = jnp.eye(m, dtype=z.dtype)[:, None, :, None]  # (m, 1, m, 1): times R, diagonal blocks
     xi: jax.Array | None = None
     for i in range(filter.iterations):
@@ -197,12 +198,12 @@ def _innovate(
         h_nu, z_hat, added_noise, jacobian = _linearize(
             filter, sensor, joint, slot, local_cov, z, memory, xi
         )
-        by_pose, by_landmark, nu = h_nu[:, :, :3], h_nu[:, :, 3:-1], h_nu[:, :, -1]
+        by_pose, by_landmark, nu = h_nu[:, :, :n], h_nu[:, :, n:-1], h_nu[:, :, -1]
         if i == 0:
             noise = jax.vmap(partial(predicted_noise, sensor))(z_hat, z, matched)
             noise = noise + added_noise
         # (m·Z) D entries, each of which P - Vᵀ V needs D times.
-        hp = hx = no_inline(project, h_nu, joint.cov[:3], landmark_rows)
+        hp = hx = no_inline(project, h_nu, joint.cov[:n], landmark_rows)
         if square_root:
             # Of a root X only H X is at hand: H P = (H X) Xᵀ, O(D²) a row.
             hp = materialize((hx.reshape(m * size_z, -1) @ joint.cov.T).reshape(hx.shape))
@@ -225,7 +226,7 @@ def _innovate(
                 inside=is_inside(distance, gamma),
                 positive=definite,
                 jacobian=jnp.concatenate(jacobian, axis=2),
-                basis=basis_of_each(filter.chart, joint.pose, joint.landmarks[slot]),
+                basis=basis_of_each(filter.robot_chart, joint.robot, joint.landmarks[slot]),
             )
             fuse = matched & prior.inside & definite
         hp = hp.reshape(m * size_z, -1)
@@ -263,7 +264,7 @@ def _linearize(
     Float[Array, "m Z C"],
     Float[Array, "m Z"],
     Float[Array, "m Z Z"],
-    tuple[Float[Array, "m Z 3"], Float[Array, "m Z L"]],
+    tuple[Float[Array, "m Z R"], Float[Array, "m Z L"]],
 ]:
     """The linearization z ≈ ẑ + H (ξ - ξ_i) at x ⊞ ξ_i; xi = None: at the prior x.
 
@@ -272,18 +273,18 @@ def _linearize(
     landmark.
     """
     state, slot_in_state = memory
-    chart, prior_landmark = filter.chart, joint.landmarks[slot]
-    pose, landmark, errors = joint.pose, prior_landmark, None
+    chart, prior_landmark = filter.robot_chart, joint.landmarks[slot]
+    pose, landmark, errors = joint.robot, prior_landmark, None
     if xi is not None:
-        capacity, size_l = joint.landmarks.shape
+        (capacity, size_l), n = joint.landmarks.shape, joint.robot_size
         # ξ_i of the robot, and of the landmark of each measurement.
-        errors = xi[:3], xi[3 : 3 + capacity * size_l].reshape(capacity, size_l)[slot]
+        errors = xi[:n], xi[n : n + capacity * size_l].reshape(capacity, size_l)[slot]
         over_landmarks = jax.vmap(chart.retract, in_axes=(None, 0, None, 0))
-        poses, landmark = over_landmarks(joint.pose, prior_landmark, *errors)
+        poses, landmark = over_landmarks(joint.robot, prior_landmark, *errors)
         pose = poses[0]  # the same for all landmarks
 
     def observe(
-        at: Int[Array, ""], landmark: Float[Array, "L"], cov: Float[Array, "3+L 3+L"]
+        at: Int[Array, ""], landmark: Float[Array, "L"], cov: Float[Array, "K K"]
     ) -> PyTree:
         point = LinearizationPoint(state, chart, pose, cov, at, landmark)
         return filter.linearize.observe(at_slot(sensor, state, at), point)
@@ -295,7 +296,7 @@ def _linearize(
     # The monitor takes H by coordinates; P is of errors in the chart, so the gain needs H by these.
     if chart.basis is not None:
         by_pose, by_landmark = chart_jacobians(
-            chart, joint.pose, prior_landmark, by_pose, by_landmark, errors
+            chart, joint.robot, prior_landmark, by_pose, by_landmark, errors
         )
     if errors is not None:
         # Back to the prior: z - h(x_i) + H ξ_i.
@@ -368,7 +369,7 @@ def correct_in_turn(
 
     The same numbers as `correct` on each alone, with P read and written once a group of them:
 
-        for each group (g measurements, W = 3 + g·L):
+        for each group (g measurements, W = R + g·L):
             P_I (W, D)  <-  rows of the robot and of the group's landmarks, of P (D, D)
             for each measurement: means and P_I corrected, P_I ← P_I - V_Iᵀ V; V (Z, D) is left
             P (D, D)    <-  P - Σ Vᵀ V over the group
@@ -382,7 +383,7 @@ def correct_in_turn(
     """
     gamma = gate_quantile(filter.gate, len(sensor.measurements))
     measurements = z, slot, matched
-    unmatched = partial(no_correction, joint, chart=filter.chart)
+    unmatched = partial(no_correction, joint, chart=filter.robot_chart)
     if filter.covariance != "plain":
 
         def correct_one(joint: Joint, measurement: Measurements) -> tuple[Joint, Correction]:
@@ -442,17 +443,17 @@ def _correct_group(
 ) -> tuple[Joint, Correction]:
     """The joint corrected by g measurements in turn: local states by each, then P by all at once.
 
-        local P (W, W) | M (W, W)     P_I after some measurements = M P_I of before, W = 3 + g·L
+        local P (W, W) | M (W, W)     P_I after some measurements = M P_I of before, W = R + g·L
         V = L⁻¹ H P = L⁻¹ H M P_I     (g·Z, D), with L⁻¹ H M (g·Z, W), `whitened_hm`
 
     P may have columns of zeros beyond its own.
     """
     slot = group[1]
-    size_l, size = joint.landmarks.shape[1], joint.cov.shape[0]
-    # Slot i owns rows 3 + i·L to 3 + (i+1)·L of P. Of a landmark that the group measures twice, the
+    size_l, size, n = joint.landmarks.shape[1], joint.cov.shape[0], joint.robot_size
+    # Slot i owns rows R + i·L to R + (i+1)·L of P. Of a landmark that the group measures twice, the
     # local map has two copies; a correction moves both by the same numbers.
-    of_landmarks = 3 + slot[:, None] * size_l + jnp.arange(size_l, dtype=slot.dtype)[None, :]
-    index = jnp.concatenate([jnp.arange(3), of_landmarks.reshape(-1)])
+    of_landmarks = n + slot[:, None] * size_l + jnp.arange(size_l, dtype=slot.dtype)[None, :]
+    index = jnp.concatenate([jnp.arange(n), of_landmarks.reshape(-1)])
     rows = joint.cov[index]  # P_I
     # M, the product of the corrections so far, begins as the identity.
     local = joint._replace(
@@ -473,15 +474,15 @@ def _correct_group(
         # One measurement as m = 1; it is of landmark i of the local map, and of slot in the map.
         i, (z, slot, matched) = jax.tree.map(lambda leaf: leaf[None], measurement)
         width = local.cov.shape[0]
-        memory = joint._replace(pose=local.pose), slot
+        memory = joint.with_robot(local.robot), slot
         innovation = _innovate(filter, sensor, local, i, z, matched, memory, gamma)
         # Of L⁻¹ H [P M], as M is in the further columns of P.
         v, whitened_hm = innovation.v[:, :width], innovation.v[:, width:]
-        pose, landmarks = retract_map(filter.chart, local, innovation.xi[:width])
+        local = retract_map(filter.robot_chart, local, innovation.xi[:width])
         # V has the columns of [P M], so M is corrected by the same product as P.
         cov = local.cov - linalg.gram(v, innovation.v)
         correction = jax.tree.map(lambda leaf: leaf[0], innovation.correction)
-        local = local._replace(pose=pose, landmarks=landmarks, cov=cov)
+        local = local._replace(cov=cov)
         return local, (whitened_hm, innovation.whitened, correction)
 
     # A gradient stores the input of each step, and recomputes the rest.
@@ -493,9 +494,9 @@ def _correct_group(
     )
     # (g·Z, D) entries, each of which P - Vᵀ V needs D times.
     v = no_inline(linalg.matmul, whitened_hm.reshape(-1, len(index)), rows)
-    landmarks = _move_map(joint, v[:, :size], whitened, filter.chart)
+    landmarks = _move_map(joint, v[:, :size], whitened, filter.robot_chart)
     cov = joint.cov - linalg.gram(v[:, :size], v)
-    return joint._replace(pose=local.pose, landmarks=landmarks, cov=cov), corrections
+    return joint.with_robot(local.robot)._replace(landmarks=landmarks, cov=cov), corrections
 
 
 def _move_map(
@@ -504,12 +505,11 @@ def _move_map(
     """The landmarks after corrections V (g·Z, D), L⁻¹ ν, one after the other."""
     if chart.basis is None:  # retractions are additive
         xi = linalg.gram(v, whitened.reshape(-1, 1))[:, 0]
-        return retract_map(chart, joint, xi)[1]
+        return retract_map(chart, joint, xi).landmarks
 
     def move(joint: Joint, correction: tuple[jax.Array, jax.Array]) -> tuple[Joint, None]:
         v, whitened = correction
-        pose, landmarks = retract_map(chart, joint, linalg.gram(v, whitened[:, None])[:, 0])
-        return joint._replace(pose=pose, landmarks=landmarks), None
+        return retract_map(chart, joint, linalg.gram(v, whitened[:, None])[:, 0]), None
 
     # (g, Z, D): a retraction that is not additive is done one measurement at a time.
     by_measurement = v.reshape(*whitened.shape, -1)
@@ -519,7 +519,7 @@ def _move_map(
 def no_correction(joint: Joint, measurements: Measurements, chart: Chart) -> Correction:
     """The `Correction` of m measurements without a match, all zero; the map is unchanged."""
     z = measurements[0]
-    (m, size), width = z.shape, 3 + joint.landmarks.shape[1]
+    (m, size), width = z.shape, joint.robot_size + joint.landmarks.shape[1]
     dtype = jnp.result_type(z, joint.pose, joint.cov)
     # As promoted in the corrected branch: both branches of a `cond` must have one dtype.
     numbers, flags = jnp.zeros(m, dtype), jnp.zeros(m, bool)

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.association._rules import Known
-from jaxslam.charts import Euclidean
+from jaxslam.charts import Euclidean, with_further
 from jaxslam.core import slots
 from jaxslam.core._record import field, function_of, record, static
 from jaxslam.core._validation import motion_model, sensor_model
@@ -62,6 +62,7 @@ from jaxslam.linearize._first_order import AtEstimate, predicted_noise
 from jaxslam.math import _linalg as linalg
 from jaxslam.math._arrays import Number
 from jaxslam.math._xla import change_where, last_true_column, materialize, where_any
+from jaxslam.sensors._suite import of_robot
 
 
 @record
@@ -73,6 +74,9 @@ class EkfSlam(Filter):
 
     Every valid measurement of an absolute sensor (L = 0: compass, position fix) corrects the robot,
     whatever its tag, and has slot -1; `associate` and `births` do not apply, and the map is empty.
+
+    The E further numbers of `Motion.state` follow the pose in P, R = 3 + E rows of the robot; their
+    errors are differences, in every chart.
 
     Several sensors are one `sensors.Suite`, whose parts are processed one after the other.
 
@@ -118,6 +122,7 @@ class EkfSlam(Filter):
     life: Life | None = field(default=None, check=or_none(instance_of(Life)))
     """a rule that removes landmarks after each scan, and may make room in a full map. Its memory is
     `Joint.life`; `info.extra["pruning"].removed` (N,) bool marks the slots"""
+    further = True
 
     def __post_init__(self) -> None:
         check_fit(self.sensor, self.chart, self.linearize, self.iterations)
@@ -132,6 +137,11 @@ class EkfSlam(Filter):
         return self.sensor.landmark
 
     @property
+    def robot_chart(self) -> Chart:
+        """The chart of all R numbers of the robot."""
+        return with_further(self.chart, self.motion.state)
+
+    @property
     def linearized(self) -> LinearizedSteps | None:
         """The steps with their linear system; None of a class that overrides one."""
         plain = type(self).predict is EkfSlam.predict and type(self).update is EkfSlam.update
@@ -139,8 +149,8 @@ class EkfSlam(Filter):
             return None
         return LinearizedSteps(lambda s, u, _: propagate(self, s, u), partial(_update, self))
 
-    def init(self, pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"]) -> Joint:
-        chart, size_l = self.chart, len(self.sensor.landmark)
+    def init(self, pose: Float[Array, "R"], pose_cov: Float[Array, "R R"]) -> Joint:
+        chart, size_l = self.robot_chart, len(self.sensor.landmark)
         if chart.basis is not None:
             # E⁻¹ P E⁻ᵀ: `pose_cov` is of coordinates, P is of the errors in the chart.
             to_errors = linalg.inverse(chart.pose_basis(pose))
@@ -153,7 +163,7 @@ class EkfSlam(Filter):
         if self.sensor.reduced is not None:
             joint = joint._replace(reduced=jnp.zeros_like(joint.alive))
         if self.life is not None:
-            joint = joint._replace(life=self.life.init(pose, joint.landmarks))
+            joint = joint._replace(life=self.life.init(joint.pose, joint.landmarks))
         return joint
 
     def predict(self, state: Joint, u: Float[Array, "U"], key: Array) -> Joint:
@@ -164,7 +174,7 @@ class EkfSlam(Filter):
 
     def estimate(self, state: Joint) -> Estimate:
         return map_coordinates.estimate_of(
-            state, self.sensor, self.chart, square_root=self.square_root
+            state, self.sensor, self.robot_chart, square_root=self.square_root
         )
 
 
@@ -175,13 +185,15 @@ def propagate(filter: EkfSlam, joint: Joint, u: Float[Array, "U"]) -> tuple[Join
     errors of the landmarks change too (`moved_cov`, O(N²)). A square root X of P = X Xᵀ becomes the
     triangular root of [A X, G √N], O(N³).
     """
-    chart = filter.chart
-    point = LinearizationPoint(joint, chart, joint.pose, slots.robot_cov(joint, filter.square_root))
+    chart, n = filter.robot_chart, joint.robot_size
+    point = LinearizationPoint(
+        joint, chart, joint.robot, slots.robot_cov(joint, filter.square_root)
+    )
     # (14) is the mean; by_pose = F and noise = W Q Wᵀ are the Jacobian and the noise of (15).
     pose, by_pose, noise, memory = filter.linearize.motion(filter.motion, u, point)
     if chart.basis is None:
         # dx ← F dx + noise; the errors of the landmarks stay.
-        unit = jnp.eye(3, dtype=noise.dtype)
+        unit = jnp.eye(n, dtype=noise.dtype)
         transition = Transition(
             robot=by_pose, cross=None, landmark=None, noise=unit, cross_noise=None
         )
@@ -190,21 +202,21 @@ def propagate(filter: EkfSlam, joint: Joint, u: Float[Array, "U"]) -> tuple[Join
         pose = materialize(pose)
         transition = transition_in_chart(chart, by_pose, joint, pose)
     if filter.square_root:
-        # Wide root [A X, G √N], (D, D + 3); reflections from the right make it (D, D) again.
+        # Wide root [A X, G √N], (D, D + R); reflections from the right make it (D, D) again.
         added = transition.lift(len(joint.cov)) @ linalg.cholesky(noise)[0]
         root = jnp.concatenate([transition.times(joint.cov), added], axis=1)
         cov = linalg.triangular_root(root)
     elif chart.basis is None:
-        # (15), (16): the three rows of the robot alone, O(N); P of the map stays as it is.
-        robot_rows = linalg.matmul(by_pose, joint.cov[:3])
-        robot_cov = linalg.symmetrize(linalg.matmul(robot_rows[:, :3], by_pose.T) + noise)
+        # (15), (16): the R rows of the robot alone, O(N); P of the map stays as it is.
+        robot_rows = linalg.matmul(by_pose, joint.cov[:n])
+        robot_cov = linalg.symmetrize(linalg.matmul(robot_rows[:, :n], by_pose.T) + noise)
         # Stored separately from P, from which it is computed, so that P is written in place.
-        rows = materialize(jnp.concatenate([robot_cov, robot_rows[:, 3:]], axis=1))
+        rows = materialize(jnp.concatenate([robot_cov, robot_rows[:, n:]], axis=1))
         # (17): the columns are the same numbers, so P stays symmetric to the bit.
-        cov = jnp.asarray(joint.cov).at[:3].set(rows).at[:, :3].set(rows.T)
+        cov = jnp.asarray(joint.cov).at[:n].set(rows).at[:, :n].set(rows.T)
     else:
         cov = moved_cov(joint.cov, transition, noise)
-    return joint._replace(pose=pose, cov=cov, lin=memory), (transition,)
+    return joint.with_robot(pose)._replace(cov=cov, lin=memory), (transition,)
 
 
 def _update(
@@ -217,6 +229,7 @@ def _update(
         if sensor is None:  # of a suite: it measures other robots, as `TeamSlam` uses
             infos.append(info_of_ignored(sensor_scan))
             continue
+        sensor = of_robot(sensor, filter.motion.state)
         joint, info, removed, sensor_system = update_by_sensor(
             filter, sensor, joint, sensor_scan, filter.births
         )
@@ -297,7 +310,7 @@ def associate_scan(
     return association._replace(is_new=scan.valid & association.is_new), matched
 
 
-_Initialized = tuple[Joint, NewLandmarks, Bool[Array, "N"], Float[Array, "M L 3"]]
+_Initialized = tuple[Joint, NewLandmarks, Bool[Array, "N"], Float[Array, "M L R"]]
 
 
 def initialize(
@@ -320,7 +333,8 @@ def initialize(
         jnp.zeros(is_new.shape, jnp.int32), no_measurement, no_measurement, no_measurement
     )
     none_evicted = jnp.zeros_like(joint.alive)
-    no_jacobian = jnp.zeros((len(is_new), joint.landmarks.shape[1], 3), joint.pose.dtype)
+    by_robot = len(is_new), joint.landmarks.shape[1], joint.robot_size
+    no_jacobian = jnp.zeros(by_robot, joint.pose.dtype)
     if births == 0:
         return joint, no_landmark._replace(deferred=is_new), none_evicted, no_jacobian
 
@@ -368,22 +382,22 @@ def augment(
     tag: Int[Array, "m"],
     slot: Int[Array, "m"],
     granted: Bool[Array, "m"],
-) -> tuple[Joint, Float[Array, "m L 3"]]:
+) -> tuple[Joint, Float[Array, "m L R"]]:
     """The joint with new landmarks of measurements z (m, Z) in free slots (m,), where granted (m,);
     and their G_R.
 
     L = g(R, z, s̄), P_LL = G_R P_RR G_Rᵀ + G_z R G_zᵀ + G_s S G_sᵀ, P_Lx = G_R P_Rx: Solà (32)-(38),
     with the prior's term of (44); several in one scan are correlated through the robot.
     """
-    chart, square_root = filter.chart, filter.square_root
-    point = LinearizationPoint(joint, chart, joint.pose, slots.robot_cov(joint, square_root))
+    chart, square_root = filter.robot_chart, filter.square_root
+    point = LinearizationPoint(joint, chart, joint.robot, slots.robot_cov(joint, square_root))
 
     def invert(
         z: Float[Array, "Z"], tag: Int[Array, ""]
-    ) -> tuple[Float[Array, "L"], Float[Array, "L 3"], Float[Array, "L L"]]:
+    ) -> tuple[Float[Array, "L"], Float[Array, "L R"], Float[Array, "L L"]]:
         # (32); G_R of (33); and what (44) adds to G_R P_RR G_Rᵀ, by the noises of z and s.
         landmark, by_pose, cov = filter.linearize.invert(sensor, z, tag, point)
-        return landmark, *landmark_errors_in_chart(chart, joint.pose, landmark, by_pose, cov)
+        return landmark, *landmark_errors_in_chart(chart, joint.robot, landmark, by_pose, cov)
 
     landmark, by_pose, landmark_covs = jax.vmap(invert)(z, tag)
     # (35)-(38): P_LL and P_Lx into rows and columns of padding, whose size does not change.

@@ -20,51 +20,56 @@ from jaxslam.math._xla import materialize
 
 
 class Transition(NamedTuple):
-    """The error model: [dx; dl_i] ← [A dx + noise; a_i dx + B_i dl_i + noise through dx]."""
+    """The error model: [dx; dl_i] ← [A dx + noise; a_i dx + B_i dl_i + noise through dx].
 
-    robot: Float[Array, "3 3"]
+    dx has R numbers: 3 of the pose, and E further ones of the robot where its state has them.
+    """
+
+    robot: Float[Array, "R R"]
     """A"""
-    cross: Float[Array, "N L 3"] | None
+    cross: Float[Array, "N L R"] | None
     """a_i; None where landmark errors are constant"""
     landmark: Float[Array, "N L L"] | None
     """B_i; None where they are the identity"""
-    noise: Float[Array, "3 3"]
+    noise: Float[Array, "R R"]
     """noise of the pose's coordinates, to dx"""
-    cross_noise: Float[Array, "N L 3"] | None
+    cross_noise: Float[Array, "N L R"] | None
     """the same, to dl_i"""
 
     def times(self, matrix: Float[Array, "D k"]) -> Float[Array, "D k"]:
         """The transition matrix times a matrix."""
-        robot = linalg.matmul(self.robot, matrix[:3])
+        n = len(self.robot)
+        robot = linalg.matmul(self.robot, matrix[:n])
         if self.cross is None:
-            return matrix.at[:3].set(robot)
+            return matrix.at[:n].set(robot)
         # a_i dx + B_i dl_i: the landmarks' rows need the robot's as they were.
-        turned = self.turn(matrix)[3:]
-        by_robot = linalg.matmul(self.cross.reshape(turned.shape[0], 3), matrix[:3])
+        turned = self.turn(matrix)[n:]
+        by_robot = linalg.matmul(self.cross.reshape(turned.shape[0], n), matrix[:n])
         return jnp.concatenate([robot, by_robot + turned])
 
     def turn(self, matrix: Float[Array, "D k"]) -> Float[Array, "D k"]:
         """The matrix with B_i applied to the landmarks' rows."""
         if self.landmark is None:
             return matrix
-        capacity, size = self.landmark.shape[:2]
+        (capacity, size), n = self.landmark.shape[:2], len(self.robot)
         # (N, L, k): rows of P by landmark and entry.
-        rows = matrix[3:].reshape(capacity, size, -1)
+        rows = matrix[n:].reshape(capacity, size, -1)
         turned = linalg.total(
             self.landmark[:, :, k, None] * rows[:, k, None, :] for k in range(size)
         )
-        return jnp.concatenate([matrix[:3], turned.reshape(capacity * size, -1)])
+        return jnp.concatenate([matrix[:n], turned.reshape(capacity * size, -1)])
 
-    def lift(self, size: int) -> Float[Array, "D 3"]:
-        """The matrix from noise of the pose's coordinates to all errors."""
-        rest = jnp.zeros((size - 3, 3), self.noise.dtype)
+    def lift(self, size: int) -> Float[Array, "D R"]:
+        """The matrix from noise of the robot's coordinates to all errors."""
+        n = len(self.noise)
+        rest = jnp.zeros((size - n, n), self.noise.dtype)
         if self.cross_noise is not None:
-            rest = self.cross_noise.reshape(size - 3, 3)
+            rest = self.cross_noise.reshape(size - n, n)
         return jnp.concatenate([self.noise, rest])
 
 
 class LinearMeasurements(NamedTuple):
-    """m measurements z ⊖ ẑ = H E (dx, dl) + v of the errors of robot and landmark, K = 3 + L."""
+    """m measurements z ⊖ ẑ = H E (dx, dl) + v of the errors of robot and landmark, K = R + L."""
 
     jacobian: Float[Array, "m Z K"]
     """H, by the coordinates of pose and landmark"""
@@ -84,7 +89,7 @@ class LinearLandmarks(NamedTuple):
     slot: Int[Array, "m"]
     granted: Bool[Array, "m"]
     """a landmark was started"""
-    by_pose: Float[Array, "m L 3"]
+    by_pose: Float[Array, "m L R"]
     """G, errors by errors"""
 
 
@@ -102,7 +107,7 @@ class LinearizedSteps:
 
 
 def transition_in_chart(
-    chart: Chart, by_pose: Float[Array, "3 3"], joint: Joint, pose: Float[Array, "3"]
+    chart: Chart, by_pose: Float[Array, "R R"], joint: Joint, pose: Float[Array, "R"]
 ) -> Transition:
     """The transition of the errors in a chart, E(x')⁻¹ F E(x), and E(x')⁻¹, E the chart's basis.
 
@@ -113,7 +118,7 @@ def transition_in_chart(
     # With E = [E_x 0; c E_l] of a landmark, which does not move itself,
     # dl' = E_l'⁻¹ (c dx + E_l dl - c' dx').
     over_map = jax.vmap(chart.basis, in_axes=(None, 0))
-    before: Basis = over_map(joint.pose, joint.landmarks)
+    before: Basis = over_map(joint.robot, joint.landmarks)
     after: Basis = over_map(pose, joint.landmarks)
     times = jax.vmap(linalg.matmul, in_axes=(0, None))
     products = jax.vmap(linalg.matmul)
@@ -133,7 +138,7 @@ def transition_in_chart(
 
 
 def moved_cov(
-    cov: Float[Array, "D D"], moved: Transition, noise: Float[Array, "3 3"] | None
+    cov: Float[Array, "D D"], moved: Transition, noise: Float[Array, "R R"] | None
 ) -> Float[Array, "D D"]:
     """The covariance A P Aᵀ + G N Gᵀ after a transition in a chart, O(N²), block by block."""
     assert moved.cross is not None
@@ -142,11 +147,12 @@ def moved_cov(
         cov = materialize(moved.turn(moved.turn(cov).T))
     cov = linalg.symmetrize(cov)
     # A = I + b e_Rᵀ, so with T = P_R + P_RR bᵀ/2 the change of P is b T + (b T)ᵀ.
-    b = jnp.concatenate([moved.robot - jnp.eye(3, dtype=cov.dtype), moved.cross.reshape(-1, 3)])
-    half = cov[:3] + 0.5 * linalg.matmul(cov[:3, :3], b.T)
+    n = len(moved.robot)
+    b = jnp.concatenate([moved.robot - jnp.eye(n, dtype=cov.dtype), moved.cross.reshape(-1, n)])
+    half = cov[:n] + 0.5 * linalg.matmul(cov[:n, :n], b.T)
     change = linalg.gram_both(*materialize((b.T, half)))
     if noise is not None:
-        # G N Gᵀ by the root of N, (D, 3): positive semi-definite and symmetric as it stands.
+        # G N Gᵀ by the root of N, (D, R): positive semi-definite and symmetric as it stands.
         added = linalg.matmul(moved.lift(cov.shape[0]), linalg.cholesky(noise)[0]).T
         change = change + linalg.self_gram(materialize(added))
     return cov + change
@@ -154,12 +160,12 @@ def moved_cov(
 
 def chart_jacobians(
     chart: Chart,
-    pose: Float[Array, "3"],
+    pose: Float[Array, "R"],
     landmarks: Float[Array, "m L"],
-    by_pose: Float[Array, "m Z 3"],
+    by_pose: Float[Array, "m Z R"],
     by_landmark: Float[Array, "m Z L"],
-    errors: tuple[Float[Array, "3"], Float[Array, "m L"]] | None = None,
-) -> tuple[Float[Array, "m Z 3"], Float[Array, "m Z L"]]:
+    errors: tuple[Float[Array, "R"], Float[Array, "m L"]] | None = None,
+) -> tuple[Float[Array, "m Z R"], Float[Array, "m Z L"]]:
     """Jacobians by errors of the chart, chained with ∂retract(pose, l, ·) at zero, or at these
     errors (dx, dl)."""
     assert chart.basis is not None
@@ -181,11 +187,11 @@ def chart_jacobians(
 
 def landmark_errors_in_chart(
     chart: Chart,
-    pose: Float[Array, "3"],
+    pose: Float[Array, "R"],
     landmark: Float[Array, "L"],
-    by_pose: Float[Array, "L 3"],
+    by_pose: Float[Array, "L R"],
     cov: Float[Array, "L L"],
-) -> tuple[Float[Array, "L 3"], Float[Array, "L L"]]:
+) -> tuple[Float[Array, "L R"], Float[Array, "L L"]]:
     """A new landmark's derivative by the pose and its own covariance, in errors of the chart."""
     if chart.basis is None:
         return by_pose, cov
@@ -199,16 +205,16 @@ def landmark_errors_in_chart(
 
 
 def basis_of_each(
-    chart: Chart, pose: Float[Array, "3"], landmarks: Float[Array, "m L"]
+    chart: Chart, pose: Float[Array, "R"], landmarks: Float[Array, "m L"]
 ) -> Float[Array, "m K K"] | None:
     """The matrix E from errors of pose and one landmark to their coordinates; None: identity."""
     if chart.basis is None:
         return None
-    m, size = landmarks.shape
+    (m, size), n = landmarks.shape, len(pose)
     basis = jax.vmap(chart.basis, in_axes=(None, 0))(pose, landmarks)
     landmark = basis.landmark
     if landmark is None:
         landmark = jnp.broadcast_to(jnp.eye(size, dtype=pose.dtype), (m, size, size))
     # [E_x 0; c E_l] for each measurement.
-    top = jnp.concatenate([basis.pose, jnp.zeros((m, 3, size), pose.dtype)], axis=2)
+    top = jnp.concatenate([basis.pose, jnp.zeros((m, n, size), pose.dtype)], axis=2)
     return jnp.concatenate([top, jnp.concatenate([basis.cross, landmark], axis=2)], axis=1)

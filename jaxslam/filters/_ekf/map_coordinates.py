@@ -16,7 +16,7 @@ from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate
 from jaxslam.filters._ekf.linear_system import Transition, moved_cov
 from jaxslam.math import _linalg as linalg
-from jaxslam.math._arrays import Landmark, Measurement, Point, Pose
+from jaxslam.math._arrays import Landmark, Measurement, Point, Robot
 from jaxslam.math._xla import where_any
 from jaxslam.sensors._suite import Wrapped
 
@@ -47,7 +47,7 @@ class _MaybePoint(Wrapped):
     as_points: Sensor
     is_point: Bool[Array, ""]
 
-    def observe(self, pose: Pose, landmark: Landmark) -> Measurement:
+    def observe(self, pose: Robot, landmark: Landmark) -> Measurement:
         as_point = self.as_points.observe(pose, landmark[:2])
         return jnp.where(self.is_point, as_point, self.sensor.observe(pose, landmark))
 
@@ -65,8 +65,8 @@ def reduce_where_ready(
 ) -> tuple[Joint, Bool[Array, "N"], Transition]:
     """The map with all landmarks reduced that may become points, which, and the transition."""
     assert sensor.reduced is not None
-    slot = jnp.arange(joint.landmarks.shape[0])
-    covs = jax.vmap(partial(slots.local_cov, joint, square_root=square_root))(slot)[:, 3:, 3:]
+    slot, n = jnp.arange(joint.landmarks.shape[0]), joint.robot_size
+    covs = jax.vmap(partial(slots.local_cov, joint, square_root=square_root))(slot)[:, n:, n:]
     linear = jax.vmap(sensor.reduced.ready, (None, 0, 0))(joint.pose, joint.landmarks, covs)
     which: jax.Array = linear & joint.alive & ~joint.reduced
 
@@ -89,7 +89,10 @@ def reduce(joint: Joint, which: Bool[Array, "N"], sensor: Sensor, square_root: b
     turned = reduction(joint, which, sensor).turn
     # Unit variance in place of the coordinates that are dropped: the invariant of padding.
     padding = jnp.concatenate(
-        [jnp.zeros(3, bool), (which[:, None] & (jnp.arange(size) >= 2)[None, :]).reshape(-1)]
+        [
+            jnp.zeros(joint.robot_size, bool),
+            (which[:, None] & (jnp.arange(size) >= 2)[None, :]).reshape(-1),
+        ]
     )
     unit = jnp.diag(padding.astype(points.dtype))
     # U = diag(padding) = U Uᵀ, so [J X, U] is a root of J P Jᵀ + U.
@@ -109,58 +112,63 @@ def reduce(joint: Joint, which: Bool[Array, "N"], sensor: Sensor, square_root: b
 
 def reduction(joint: Joint, which: Bool[Array, "N"], sensor: Sensor) -> Transition:
     """The transition of the errors in `reduce`."""
-    capacity, size = joint.landmarks.shape
+    (capacity, size), n = joint.landmarks.shape, joint.robot_size
     by_landmark = jax.vmap(jax.jacfwd(sensor.position))(joint.landmarks)
-    still = jnp.eye(3, dtype=by_landmark.dtype)
+    still = jnp.eye(n, dtype=by_landmark.dtype)
     # Zero rows below J (2, L) make it square: the rows of the coordinates that are dropped.
     freed = jnp.pad(by_landmark, [(0, 0), (0, size - 2), (0, 0)])
     gain = jnp.where(which[:, None, None], freed, jnp.eye(size, dtype=still.dtype))
-    return Transition(still, jnp.zeros((capacity, size, 3), still.dtype), gain, still, None)
+    return Transition(still, jnp.zeros((capacity, size, n), still.dtype), gain, still, None)
 
 
 def estimate_of(
     joint: Joint, sensor: Sensor, chart: Chart, *, square_root: bool = False
 ) -> Estimate:
-    """Means and marginal covariances in map coordinates, for any chart and landmark parameters."""
-    capacity, size = joint.landmarks.shape
+    """Means and marginal covariances in map coordinates, for any chart and landmark parameters.
+
+    chart: of the robot's R numbers, as `EkfSlam.robot_chart`.
+    """
+    (capacity, size), n, robot = joint.landmarks.shape, joint.robot_size, joint.robot
     cov = joint.cov @ joint.cov.T if square_root else joint.cov
-    pose_cov = cov[:3, :3]
+    robot_cov = cov[:n, :n]
     slot = jnp.arange(capacity)
     # P of landmarks by slot and entry, (N, L, N, L): its diagonal blocks.
-    own_covs = cov[3:, 3:].reshape(capacity, size, capacity, size)[slot, :, slot]
-    with_pose = cov[3:, :3].reshape(capacity, size, 3)
+    own_covs = cov[n:, n:].reshape(capacity, size, capacity, size)[slot, :, slot]
+    with_pose = cov[n:, :n].reshape(capacity, size, n)
 
     def point(
         landmark: Float[Array, "L"],
         cov: Float[Array, "L L"],
-        by_robot: Float[Array, "L 3"],
+        by_robot: Float[Array, "L R"],
         reduced: PyTree,
     ) -> tuple[Float[Array, "2"], Float[Array, "2 2"]]:
         position = _measured_points(sensor, reduced).position
         by_landmark = jax.jacfwd(position)(landmark)
         if chart.basis is not None:
-            basis = chart.basis(joint.pose, landmark)
+            basis = chart.basis(robot, landmark)
             if basis.landmark is not None:
                 cov, by_robot = basis.landmark @ cov @ basis.landmark.T, basis.landmark @ by_robot
             # [c E_l] P [c E_l]ᵀ of pose and landmark: the mixed terms, then c P_RR cᵀ.
             cross = basis.cross @ by_robot.T
             cov = cov + cross + cross.T
-            cov = cov + basis.cross @ pose_cov @ basis.cross.T
+            cov = cov + basis.cross @ robot_cov @ basis.cross.T
         return position(landmark), by_landmark @ cov @ by_landmark.T
 
     points, point_covs = jax.vmap(point)(joint.landmarks, own_covs, with_pose, joint.reduced)
     if chart.basis is not None:
-        basis = chart.pose_basis(joint.pose)
-        pose_cov = basis @ pose_cov @ basis.T
+        basis = chart.pose_basis(robot)
+        robot_cov = basis @ robot_cov @ basis.T
     # The position of a landmark of zeros may be anything (of an inverse depth, 1000 km away).
     unit = jnp.eye(2, dtype=point_covs.dtype)[None]
     return Estimate(
         pose=joint.pose,
-        pose_cov=pose_cov,
+        pose_cov=robot_cov if n == 3 else robot_cov[:3, :3],
         points=jnp.where(joint.alive[:, None], points, 0.0),
         point_covs=jnp.where(joint.alive[:, None, None], point_covs, unit),
         alive=joint.alive,
         tag=joint.tag,
+        further=joint.further,
+        further_cov=None if n == 3 else robot_cov[3:, 3:],
     )
 
 
@@ -171,7 +179,7 @@ def cov_of_coordinates(
     cov = joint.cov @ joint.cov.T if square_root else joint.cov
     if chart.basis is None:
         return cov
-    basis = jax.vmap(chart.basis, in_axes=(None, 0))(joint.pose, joint.landmarks)
+    basis = jax.vmap(chart.basis, in_axes=(None, 0))(joint.robot, joint.landmarks)
     alive = joint.alive[:, None, None]
     # Padding stays as it is, whatever the basis at a landmark of zeros.
     cross = jnp.where(alive, basis.cross, 0.0)
@@ -186,7 +194,7 @@ def with_cov_of_coordinates(
 ) -> Joint:
     """The state with covariance cov (D, D) in map coordinates, at the same estimate."""
     if chart.basis is not None:
-        basis = jax.vmap(chart.basis, in_axes=(None, 0))(joint.pose, joint.landmarks)
+        basis = jax.vmap(chart.basis, in_axes=(None, 0))(joint.robot, joint.landmarks)
         alive = joint.alive[:, None, None]
         undo = linalg.inverse(basis.pose[0])
         # E⁻¹ = [E_x⁻¹ 0; -E_l⁻¹ c E_x⁻¹, E_l⁻¹].
@@ -200,13 +208,13 @@ def with_cov_of_coordinates(
     return joint._replace(cov=linalg.root_psd(cov) if square_root else cov)
 
 
-def retract_map(
-    chart: Chart, joint: Joint, xi: Float[Array, "D"]
-) -> tuple[Float[Array, "3"], Float[Array, "N L"]]:
-    """Pose (3,) and landmarks (N, L) moved by errors ξ (D,)."""
+def retract_map(chart: Chart, joint: Joint, xi: Float[Array, "D"]) -> Joint:
+    """The robot and the landmarks moved by errors ξ (D,), with the covariance as it was."""
+    n = joint.robot_size
     over_landmarks = jax.vmap(chart.retract, in_axes=(None, 0, None, 0))
-    poses, landmarks = over_landmarks(
-        joint.pose, joint.landmarks, xi[:3], xi[3:].reshape(joint.landmarks.shape)
+    robots, landmarks = over_landmarks(
+        joint.robot, joint.landmarks, xi[:n], xi[n:].reshape(joint.landmarks.shape)
     )
+    joint = joint.with_robot(robots[0])  # the same for all landmarks
     # dx alone moves a dead landmark too in some charts: the direction of a ray turns with the map.
-    return poses[0], jnp.where(joint.alive[:, None], landmarks, 0.0)
+    return joint._replace(landmarks=jnp.where(joint.alive[:, None], landmarks, 0.0))

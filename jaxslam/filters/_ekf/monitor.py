@@ -18,21 +18,22 @@ _TINY = 1e-30
 
 
 class Monitor(NamedTuple):
-    """The three directions that should stay unobservable, propagated by the linearized system.
+    """The directions that may be unobservable, propagated by the linearized system.
 
     A direction n starts at the robot and is propagated by the transition matrices and by the
     Jacobians of new landmarks. It is unobservable as long as H n = 0 for all later measurements;
-    these directions span the unobservable subspace.
+    these directions span the unobservable subspace. Three of the pose should stay so; one of a
+    further number of the robot (R = 3 + E), as a bias, stays so while nothing tells it.
     """
 
-    directions: Float[Array, "D 3"]
+    directions: Float[Array, "D R"]
     """in the filter's chart; rows of the robot begin as the unit matrix. Those of a free slot mean
     nothing"""
-    information: Float[Array, "3 3"]
+    information: Float[Array, "R R"]
     """Σ (H n)ᵀ R⁻¹ (H n) of all corrections"""
-    scale: Float[Array, "3"]
+    scale: Float[Array, "R"]
     """Σ of the same with absolute values, the scale of rounding errors"""
-    turn: Float[Array, "3"]
+    turn: Float[Array, "R"]
     """the combination of directions that rotates robot and map about the origin by 1 rad"""
 
 
@@ -58,6 +59,7 @@ class Monitored(Wrapper):
     """an `EkfSlam`, or one merged or with loops closed"""
     square_root = False
     landmark = ()
+    further = True
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -72,12 +74,14 @@ class Monitored(Wrapper):
         state, chart = self.filter.init(pose, pose_cov), self.chart
         # The derivative of the pose by a rotation about the origin; that of a landmark follows from
         # it, since the directions of a new landmark are linear in those of the robot.
+        n = len(pose)
         turn = jnp.stack([-pose[1], pose[0], jnp.ones_like(pose[0])])
         if chart.basis is not None:
-            turn = linalg.inverse(chart.pose_basis(pose)) @ turn
-        nothing = jnp.zeros((3, 3), pose.dtype)
-        # (D, 3): the identity for the robot; rows of landmarks are set when they are started.
-        directions = jnp.eye(state.cov.shape[0], 3, dtype=pose.dtype)
+            turn = linalg.inverse(chart.pose_basis(pose[:3] if n > 3 else pose)) @ turn
+        turn = jnp.pad(turn, (0, n - 3)) if n > 3 else turn
+        nothing = jnp.zeros((n, n), pose.dtype)
+        # (D, R): the identity for the robot; rows of landmarks are set when they are started.
+        directions = jnp.eye(state.cov.shape[0], n, dtype=pose.dtype)
         return MonitoredState(state, Monitor(directions, nothing, nothing[0], turn))
 
     def predict(self, state: MonitoredState, u: Array, key: Array) -> MonitoredState:
@@ -94,6 +98,7 @@ class Monitored(Wrapper):
 
 def after(monitor: Monitor, system: LinearSystem) -> Monitor:
     """The monitor after a linear system."""
+    n = monitor.directions.shape[1]
     for part in system:
         if isinstance(part, LinearMeasurements):
             monitor = _with_information(monitor, part)
@@ -101,9 +106,9 @@ def after(monitor: Monitor, system: LinearSystem) -> Monitor:
             # Rows of new landmarks; beyond the last, which `mode="drop"` ignores, where no landmark
             # was started.
             directions = monitor.directions
-            rows = _rows(part.slot, part.by_pose.shape[1])
+            rows = _rows(n, part.slot, part.by_pose.shape[1])
             rows = jnp.where(part.granted[:, None], rows, len(directions))
-            new = part.by_pose @ directions[:3]
+            new = part.by_pose @ directions[:n]
             monitor = monitor._replace(directions=directions.at[rows].set(new, mode="drop"))
         else:
             monitor = monitor._replace(directions=part.times(monitor.directions))
@@ -112,9 +117,10 @@ def after(monitor: Monitor, system: LinearSystem) -> Monitor:
 
 def _with_information(monitor: Monitor, seen: LinearMeasurements) -> Monitor:
     """The monitor with the information of these measurements added."""
-    rows = _rows(seen.slot, seen.jacobian.shape[2] - 3)
-    # (m, 3 + L, 3): what robot and landmark of each measurement change along each direction.
-    robot = jnp.broadcast_to(monitor.directions[:3], (len(rows), 3, 3))
+    n = monitor.directions.shape[1]
+    rows = _rows(n, seen.slot, seen.jacobian.shape[2] - n)
+    # (m, R + L, R): what robot and landmark of each measurement change along each direction.
+    robot = jnp.broadcast_to(monitor.directions[:n], (len(rows), n, n))
     local = jnp.concatenate([robot, monitor.directions[rows]], axis=1)
     if seen.basis is not None:
         local = _product(seen.basis, local)
@@ -137,9 +143,9 @@ def _with_information(monitor: Monitor, seen: LinearMeasurements) -> Monitor:
     )
 
 
-def _rows(slot: Array, size: int) -> Array:
-    """The rows (m, L) of the errors of landmarks in slot (m,)."""
-    return 3 + slot[:, None] * size + jnp.arange(size)[None, :]
+def _rows(first: int, slot: Array, size: int) -> Array:
+    """The rows (m, L) of the errors of landmarks in slot (m,), after `first` of the robot."""
+    return first + slot[:, None] * size + jnp.arange(size)[None, :]
 
 
 def _product(a: Float[Array, "m i j"], b: Float[Array, "m j k"]) -> Float[Array, "m i k"]:

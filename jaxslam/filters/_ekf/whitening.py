@@ -1,7 +1,7 @@
 """The products and factors of a correction: H P, S = H P Hᵀ + R = L Lᵀ, and what L⁻¹ whitens.
 
 m measurements of Z numbers are rows (m, Z) of one vector ν of K = m·Z numbers; a measurement
-involves the robot and one landmark, so H has 3 + L columns a measurement, and no D×D product is
+involves the robot and one landmark, so H has R + L columns a measurement, and no D×D product is
 formed.
 
 Why some lines are called by `no_inline` or stored by `materialize` (`math._xla`): XLA on a CPU
@@ -22,34 +22,35 @@ from jaxslam.math._xla import materialize, no_inline
 
 @linalg.rematerialize
 def project(
-    rows: Float[Array, "m Z C"], robot: Float[Array, "3 D"], landmark: Float[Array, "m L D"]
+    rows: Float[Array, "m Z C"], robot: Float[Array, "R D"], landmark: Float[Array, "m L D"]
 ) -> Float[Array, "m Z D"]:
-    """The product H P (m, Z, D) of H = rows[…, :3+L] with the rows of P that it involves.
+    """The product H P (m, Z, D) of H = rows[…, :R+L] with the rows of P that it involves.
 
-    Written as a sum of 3 + L outer products, which XLA vectorizes over D; a batched matrix product
+    Written as a sum of R + L outer products, which XLA vectorizes over D; a batched matrix product
     of such thin matrices is a library call for each.
     """
-    terms = [rows[:, :, k, None] * robot[None, None, k] for k in range(3)]
-    terms += [rows[:, :, 3 + k, None] * landmark[:, None, k] for k in range(landmark.shape[1])]
+    n = len(robot)
+    terms = [rows[:, :, k, None] * robot[None, None, k] for k in range(n)]
+    terms += [rows[:, :, n + k, None] * landmark[:, None, k] for k in range(landmark.shape[1])]
     return linalg.total(terms)
 
 
 def projected_cov(
     hp: Float[Array, "m Z D"],
-    by_pose: Float[Array, "m Z 3"],
+    by_pose: Float[Array, "m Z R"],
     by_landmark: Float[Array, "m Z L"],
     slot: Int[Array, "m"],
     capacity: int,
 ) -> Float[Array, "m Z m Z"]:
     """The covariance H P Hᵀ of predicted measurements, from the columns of H P that H meets."""
-    m, size_z, size_l = by_landmark.shape
+    (m, size_z, size_l), n = by_landmark.shape, by_pose.shape[2]
     # Axes: measurement and entry of the first, measurement and entry of the second.
-    cov = linalg.total(hp[:, :, k, None, None] * by_pose[None, None, :, :, k] for k in range(3))
+    cov = linalg.total(hp[:, :, k, None, None] * by_pose[None, None, :, :, k] for k in range(n))
     if size_l == 0:
         return cov
     # Columns of H P by landmark: measurement and entry, then slot and entry (m, Z, N, L); of these
     # the landmark of each measurement, (m, Z, m, L).
-    by_slot = hp[:, :, 3 : 3 + capacity * size_l].reshape(m, size_z, capacity, size_l)
+    by_slot = hp[:, :, n : n + capacity * size_l].reshape(m, size_z, capacity, size_l)
     at_landmark = by_slot[:, :, slot]
     return cov + linalg.total(
         at_landmark[..., k, None] * by_landmark[None, None, :, :, k] for k in range(size_l)

@@ -1,10 +1,10 @@
 """Filter steps in the canonical (information) form of a Gaussian over a robot and A landmarks.
 
-The error e = x - μ, D = 3 + A·L numbers, has the information matrix Ω (D, D), the inverse of its
-covariance, and the information residual ρ = Ω E[e] (D,): the textbooks' information vector is
-ξ = Ω μ + ρ. Storing ρ instead of ξ is equivalent, and has advantages: a heading may wrap, a large
-map causes no cancellation in float32, ρ = 0 means that μ is the mean, and operations that keep the
-mean (sparsification: ξ̃ = ξ + (Ω̃ - Ω) μ) keep ρ.
+The error e = x - μ, D = R + A·L numbers, R = 3 of a pose, has the information matrix Ω (D, D), the
+inverse of its covariance, and the information residual ρ = Ω E[e] (D,): the textbooks' information
+vector is ξ = Ω μ + ρ. Storing ρ instead of ξ is equivalent, and has advantages: a heading may wrap,
+a large map causes no cancellation in float32, ρ = 0 means that μ is the mean, and operations that
+keep the mean (sparsification: ξ̃ = ξ + (Ω̃ - Ω) μ) keep ρ.
 
 Padding, an index without a landmark: zero mean, zero links, unit diagonal of Ω, zero of ρ.
 Sources: Thrun et al., "Simultaneous localization and mapping with sparse extended information
@@ -32,9 +32,9 @@ from jaxslam.math._arrays import Number
 from jaxslam.math.angles import wrap
 
 
-def initial_information(pose_cov: Float[Array, "3 3"], floor: Number) -> Float[Array, "3 3"]:
+def initial_information(pose_cov: Float[Array, "R R"], floor: Number) -> Float[Array, "R R"]:
     """The first information P0⁻¹, or (P0 + floor² I)⁻¹ where P0 is not positive definite."""
-    eye = jnp.eye(3, dtype=pose_cov.dtype)
+    eye = jnp.eye(len(pose_cov), dtype=pose_cov.dtype)
     positive = linalg.cholesky(pose_cov)[1]
     safe = jnp.where(positive, pose_cov, pose_cov + jnp.asarray(floor, eye.dtype) ** 2 * eye)
     return linalg.symmetrize(linalg.solve_psd(safe, eye)[0])
@@ -42,12 +42,12 @@ def initial_information(pose_cov: Float[Array, "3 3"], floor: Number) -> Float[A
 
 def motion_update(
     motion: Motion,
-    pose: Float[Array, "3"],
+    pose: Float[Array, "R"],
     u: Float[Array, "U"],
     omega: Float[Array, "D D"],
     residual: Float[Array, "D"],
-) -> tuple[Float[Array, "3"], Float[Array, "D D"], Float[Array, "D"]]:
-    """Pose, Ω and ρ after a control, by 3×3 inversions only.
+) -> tuple[Float[Array, "R"], Float[Array, "D D"], Float[Array, "D"]]:
+    """Pose, Ω and ρ after a control, by R×R inversions only.
 
     With F = ∂f/∂pose and S Sᵀ = W Q Wᵀ (any rank), Φ = F⁻ᵀ Ω F⁻¹ and φ = F⁻ᵀ ρ on the robot's rows,
 
@@ -56,21 +56,22 @@ def motion_update(
     which is (Φ⁻¹ + W Q Wᵀ)⁻¹ by the inversion lemma, in Joseph's form, which is less sensitive to
     rounding. G is zero except for the landmarks that the robot is linked to.
     """
+    n = len(pose)
     after, by_pose, noise = first_order.motion_at(motion, pose, u, pose)
     root = linalg.root_psd(noise)
     back = linalg.inverse(by_pose)
     # F concerns the robot alone: only its rows and columns change.
-    phi = omega.at[:3].set(back.T @ omega[:3])
-    phi = phi.at[:, :3].set(phi[:, :3] @ back)
-    residual = residual.at[:3].set(back.T @ residual[:3])
-    # Sᵀ Φ; the inner matrix I + Sᵀ Φ S is 3×3 and positive definite for any rank of S.
-    by_noise = root.T @ phi[:3]
-    inner = jnp.eye(3, dtype=omega.dtype) + by_noise[:, :3] @ root
+    phi = omega.at[:n].set(back.T @ omega[:n])
+    phi = phi.at[:, :n].set(phi[:, :n] @ back)
+    residual = residual.at[:n].set(back.T @ residual[:n])
+    # Sᵀ Φ; the inner matrix I + Sᵀ Φ S is R×R and positive definite for any rank of S.
+    by_noise = root.T @ phi[:n]
+    inner = jnp.eye(n, dtype=omega.dtype) + by_noise[:, :n] @ root
     gain = (linalg.inverse(linalg.symmetrize(inner)) @ by_noise).T
     # (I - G Sᵀ) Φ, and below its product with (I - G Sᵀ)ᵀ.
     left = phi - gain @ by_noise
-    omega = left - (left[:, :3] @ root) @ gain.T + gain @ gain.T
-    return after, linalg.symmetrize(omega), residual - gain @ (root.T @ residual[:3])
+    omega = left - (left[:, :n] @ root) @ gain.T + gain @ gain.T
+    return after, linalg.symmetrize(omega), residual - gain @ (root.T @ residual[:n])
 
 
 def measurement_update(
@@ -91,16 +92,20 @@ def mean_error(
     return jnp.where(solved, error, 0.0), solved
 
 
-def correct_pose(pose: Float[Array, "3"], error: Float[Array, "3"]) -> Float[Array, "3"]:
-    """The pose moved by an error, its heading wrapped."""
+def correct_pose(
+    pose: Float[Array, "R"], error: Float[Array, "R"], turns: tuple[int, ...] = (2,)
+) -> Float[Array, "R"]:
+    """The pose, or robot, moved by an error, its angles wrapped; turns: the entries they are."""
     moved = pose + error
-    return moved.at[2].set(wrap(moved[2]))
+    for k in turns:
+        moved = moved.at[k].set(wrap(moved[k]))
+    return moved
 
 
 def initialize_landmarks(
     sensor: Sensor,
     omega: Float[Array, "D D"],
-    pose: Float[Array, "3"],
+    pose: Float[Array, "R"],
     z: Float[Array, "M Z"],
     index: Int[Array, "M"],
     wanted: Bool[Array, "M"],
@@ -112,8 +117,8 @@ def initialize_landmarks(
     change. This is the augmentation in covariance form, Solà (32)-(38). A landmark whose C is not
     positive definite is not initialized.
     """
-    size = len(sensor.landmark)
-    count = (omega.shape[0] - 3) // size
+    size, n = len(sensor.landmark), len(pose)
+    count = (omega.shape[0] - n) // size
     # Absent measurements are replaced by a value at which every model is smooth.
     z = jnp.where(wanted[:, None], z, 1.0)
     landmark, by_pose, cov = jax.vmap(lambda z: first_order.invert_at(sensor, pose, z, pose, z))(z)
@@ -123,11 +128,11 @@ def initialize_landmarks(
     both = jax.vmap(linalg.solve_lower)(root, jnp.concatenate([-by_pose, unit], axis=2))
     # Rows of zeros add nothing to Jᵀ C⁻¹ J.
     both = jnp.where(initialized[:, None, None], both, 0.0)
-    rows = stack_jacobians(both[:, :, :3], both[:, :, 3:], index, count)
+    rows = stack_jacobians(both[:, :, :n], both[:, :, n:], index, count)
     slots = jnp.arange(count, dtype=index.dtype)
     filled = (initialized[:, None] & (index[:, None] == slots[None, :])).any(axis=0)
     # Padding's unit goes first, to an exact zero.
-    padding = jnp.concatenate([jnp.zeros(3, bool), jnp.repeat(filled, size)])
+    padding = jnp.concatenate([jnp.zeros(n, bool), jnp.repeat(filled, size)])
     omega = omega - jnp.diag(padding.astype(omega.dtype)) + rows.T @ rows
     return linalg.symmetrize(omega), landmark, initialized
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int, PyTree
 
+from jaxslam.charts import with_further
 from jaxslam.core._record import record, static
 from jaxslam.core.protocols import Filter, Wrapper
 from jaxslam.core.slots import Joint
@@ -18,12 +19,14 @@ from jaxslam.filters._ekf.map_coordinates import estimate_of
 from jaxslam.filters._information import canonical, tag_innovation
 from jaxslam.filters._information.tag_innovation import InformationFilter, associate_by_table
 from jaxslam.math import _linalg as linalg
+from jaxslam.sensors._suite import of_robot
 
 
 class CanonicalState(NamedTuple):
-    """Robot and map in canonical form; D = 3 + N·L, slots and padding as in `slots.Joint`."""
+    """Robot and map in canonical form; D = R + N·L, slots and padding as in `slots.Joint`."""
 
-    pose: Float[Array, "3"]
+    pose: Float[Array, "R"]
+    """with the further numbers of the robot after it, R = 3 + E"""
     landmarks: Float[Array, "N L"]
     omega: Float[Array, "D D"]
     """Ω, the inverse of the covariance; a dead slot has unit diagonal"""
@@ -55,14 +58,16 @@ class EifSlam(InformationFilter):
     which may make it positive definite for the next scan.
     """
 
+    further = True
+
     def init(self, pose: Array, pose_cov: Array) -> CanonicalState:
-        capacity, size = self.capacity, len(self.sensor.landmark)
-        d = 3 + capacity * size
+        capacity, size, n = self.capacity, len(self.sensor.landmark), len(pose)
+        d = n + capacity * size
         information = canonical.initial_information(pose_cov, self.floor).astype(pose.dtype)
         return CanonicalState(
             pose=pose,
             landmarks=jnp.zeros((capacity, size), pose.dtype),
-            omega=jnp.eye(d, dtype=pose.dtype).at[:3, :3].set(information),
+            omega=jnp.eye(d, dtype=pose.dtype).at[:n, :n].set(information),
             residual=jnp.zeros(d, pose.dtype),
             alive=jnp.zeros(capacity, bool),
             tag=jnp.full(capacity, -1, jnp.int32),
@@ -77,7 +82,8 @@ class EifSlam(InformationFilter):
 
     def update(self, state: CanonicalState, scan: Scan, key: Array) -> tuple[CanonicalState, Info]:
         association = associate_by_table(state.tag, state.alive, scan)
-        slot = association.slot
+        slot, n, names = association.slot, len(state.pose), self.motion.state
+        sensor = of_robot(self.sensor, names)
         innovations = tag_innovation.innovations(
             self, state.omega, state.pose, state.landmarks, scan, slot, association.matched
         )
@@ -85,12 +91,13 @@ class EifSlam(InformationFilter):
         # The mean is corrected before new landmarks are linearized at it.
         error, solved = canonical.mean_error(omega, residual, innovations.omega_positive)
         innovations = tag_innovation.refuse_unless(solved, innovations)
-        pose = canonical.correct_pose(state.pose, error[:3])
-        landmarks = state.landmarks + error[3:].reshape(state.landmarks.shape)
+        turns = tuple(k for k, name in enumerate(names) if name.endswith("[rad]"))
+        pose = canonical.correct_pose(state.pose, error[:n], turns)
+        landmarks = state.landmarks + error[n:].reshape(state.landmarks.shape)
         landmarks = jnp.where(state.alive[:, None], landmarks, 0.0)
         wanted = association.new & association.has_slot & solved
         omega, new_landmarks, initialized = canonical.initialize_landmarks(
-            self.sensor, omega, pose, scan.z, slot, wanted
+            sensor, omega, pose, scan.z, slot, wanted
         )
         into = jnp.where(initialized, slot, self.capacity)  # beyond the end: dropped
         state = state._replace(
@@ -107,7 +114,8 @@ class EifSlam(InformationFilter):
     def estimate(self, state: CanonicalState) -> Estimate:
         cov = linalg.inverse_psd(state.omega)
         joint = Joint(state.pose, state.landmarks, cov, state.alive, state.tag, ())
-        return estimate_of(joint, self.sensor, self.chart)
+        chart = with_further(self.chart, self.motion.state)
+        return estimate_of(joint.with_robot(state.pose), self.sensor, chart)
 
 
 @record
@@ -120,6 +128,7 @@ class InPieces(Wrapper):
 
     filter: Filter
     size: int = static()
+    further = True
 
     @property
     def name(self) -> str:  # type: ignore[override]

@@ -21,7 +21,7 @@ from jaxslam.linearize._first_order import observe_jacobians, predicted_noise
 from jaxslam.math import _linalg as linalg
 from jaxslam.math._arrays import Number
 from jaxslam.math._gaussians import gaussian_terms, is_inside, log_density, log_det_of_pivots
-from jaxslam.sensors._suite import Suite
+from jaxslam.sensors._suite import Suite, of_robot
 
 
 @record
@@ -126,7 +126,7 @@ class CanonicalInnovations(NamedTuple):
 def innovations(
     filter: InformationFilter,
     omega: Float[Array, "D D"],
-    pose: Float[Array, "3"],
+    pose: Float[Array, "R"],
     landmarks: Float[Array, "A L"],
     scan: Scan,
     index: Int[Array, "M"],
@@ -140,7 +140,7 @@ def innovations(
     Args:
         index: the landmark of each measurement, where matched.
     """
-    sensor = filter.sensor
+    sensor = of_robot(filter.sensor, filter.motion.state)
     m, size = scan.z.shape
     gamma = gate_quantile(filter.gate, size)
     z = jnp.where(scan.valid[:, None], scan.z, 0.0)
@@ -182,18 +182,18 @@ def innovations(
 
 
 def stack_jacobians(
-    by_pose: Float[Array, "M Z 3"],
+    by_pose: Float[Array, "M Z R"],
     by_landmark: Float[Array, "M Z L"],
     index: Int[Array, "M"],
     count: int,
 ) -> Float[Array, "MZ D"]:
-    """The Jacobian H of M functions of pose and a landmark, index of `count`; D = 3 + count·L."""
-    m, rows, size = by_landmark.shape
+    """The Jacobian H of M functions of pose and a landmark, index of `count`; D = R + count·L."""
+    (m, rows, size), n = by_landmark.shape, by_pose.shape[2]
     columns = jnp.arange(count, dtype=index.dtype)
     at = (index[:, None] == columns[None, :]).astype(by_landmark.dtype)
     # Axes (measurement, row, landmark, parameter); the last two are the columns of the map.
     wide = jnp.einsum("mkl,ma->mkal", by_landmark, at).reshape(m, rows, count * size)
-    return jnp.concatenate([by_pose, wide], axis=2).reshape(m * rows, 3 + count * size)
+    return jnp.concatenate([by_pose, wide], axis=2).reshape(m * rows, n + count * size)
 
 
 def _densities_in_turn(

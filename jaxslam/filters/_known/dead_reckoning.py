@@ -19,7 +19,7 @@ from jaxslam.linearize._first_order import AtEstimate
 
 @record
 class DeadReckoning(Filter):
-    """The predicted pose alone, x ← f(x, u, 0) and P ← F P Fᵀ + W Q Wᵀ (Solà (14), (15)).
+    """The predicted robot alone, x ← f(x, u, 0) and P ← F P Fᵀ + W Q Wᵀ (Solà (14), (15)).
 
     Every measurement is `Status.UNMATCHED`, and the map stays empty. The sensor only gives the size
     of measurements; chart and linearize are those of `EkfSlam`, with the same errors.
@@ -30,12 +30,13 @@ class DeadReckoning(Filter):
     _: dataclasses.KW_ONLY
     chart: Chart = field(default=Euclidean(), check=instance_of(Chart))
     linearize: Linearizer = field(default=AtEstimate(), check=instance_of(Linearizer))
+    further = True
 
     def __post_init__(self) -> None:
         check_fit(self.sensor, self.chart, self.linearize)
         super().__post_init__()
 
-    def init(self, pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"]) -> Joint:
+    def init(self, pose: Float[Array, "R"], pose_cov: Float[Array, "R R"]) -> Joint:
         return self._ekf.init(pose, pose_cov)
 
     def predict(self, state: Joint, u: Float[Array, "U"], key: Array) -> Joint:

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
 
 from jaxslam.association._rules import Known, prediction_from
-from jaxslam.charts import Euclidean
+from jaxslam.charts import Euclidean, with_further
 from jaxslam.core._numbers import gate_quantile
 from jaxslam.core._record import field, function_of, record, static
 from jaxslam.core._validation import motion_model, sensor_model
@@ -52,18 +52,20 @@ from jaxslam.linearize._first_order import AtEstimate, predicted_noise
 from jaxslam.math import _linalg as linalg
 from jaxslam.math._arrays import Number
 from jaxslam.math._gaussians import gaussian_terms, is_inside, log_det_of_pivots
+from jaxslam.sensors._suite import of_robot
 
 
 @record
 class Localization(Filter):
     """Extended Kalman filter of the pose in a known map without errors (Williams, localization).
 
-    The equations of EKF-SLAM with P_ll = 0: z = h(x, l_j) with H by the pose only, P (3, 3). A step
-    costs O(M), plus the search for tags among N (0.09 ms a step with 10,000); association other
-    than by tags compares all landmarks. With a `sensors.Suite`, absolute sensors (compass, position
-    fix) correct in the same update.
+    The equations of EKF-SLAM with P_ll = 0: z = h(x, l_j) with H by the robot alone, P (R, R): here
+    R = 3, or 3 + E with the further numbers of `Motion.state`. A step costs O(M), plus the search
+    for tags among N (0.09 ms a step with 10,000); association other than by tags compares all
+    landmarks. With a `sensors.Suite`, absolute sensors (compass, position fix) correct in the same
+    update.
 
-    The state is a `slots.Joint` of the map, whose P (3, 3) is the robot's. A measurement without a
+    The state is a `slots.Joint` of the map, whose P (R, R) is the robot's. A measurement without a
     landmark in the map is `Status.UNMATCHED`.
 
     Raises ValueError on a map that is not finite (N, L), tags that are not N different numbers from
@@ -95,6 +97,7 @@ class Localization(Filter):
         default="plain", check=one_of("plain", "joseph")
     )
     """See `EkfSlam.covariance`."""
+    further = True
 
     def __post_init__(self) -> None:
         linearize = self.linearize
@@ -110,23 +113,30 @@ class Localization(Filter):
         is_whole = self.tags is None and self.sensor.landmark
         return np.shape(self.landmarks)[0] if is_whole else None
 
-    def init(self, pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"]) -> Joint:
+    @property
+    def robot_chart(self) -> Chart:
+        """The chart of all R numbers of the robot."""
+        return with_further(self.chart, self.motion.state)
+
+    def init(self, pose: Float[Array, "R"], pose_cov: Float[Array, "R R"]) -> Joint:
         landmarks, tags = jnp.asarray(self.landmarks, pose.dtype), map_tags(self)
         if self.chart.basis is not None:
-            undo = linalg.inverse(self.chart.pose_basis(pose))
+            undo = linalg.inverse(self.robot_chart.pose_basis(pose))
             pose_cov = undo @ pose_cov @ undo.T
         lin = self.linearize.init(pose, landmarks)
-        return Joint(pose, landmarks, pose_cov, jnp.ones(len(tags), bool), tags, lin)
+        joint = Joint(pose, landmarks, pose_cov, jnp.ones(len(tags), bool), tags, lin)
+        return joint.with_robot(pose)
 
     def predict(self, state: Joint, u: Float[Array, "U"], key: Array) -> Joint:
-        point = LinearizationPoint(state, self.chart, state.pose, state.cov)
+        chart = self.robot_chart
+        point = LinearizationPoint(state, chart, state.robot, state.cov)
         pose, f, noise, lin = self.linearize.motion(self.motion, u, point)
-        if self.chart.basis is not None:
-            undo = linalg.inverse(self.chart.pose_basis(pose))
-            f = linalg.matmul(linalg.matmul(undo, f), self.chart.pose_basis(state.pose))
+        if chart.basis is not None:
+            undo = linalg.inverse(chart.pose_basis(pose))
+            f = linalg.matmul(linalg.matmul(undo, f), chart.pose_basis(state.robot))
             noise = linalg.matmul(linalg.matmul(undo, noise), undo.T)
         cov = linalg.symmetrize(linalg.matmul(linalg.matmul(f, state.cov), f.T) + noise)
-        return state._replace(pose=pose, cov=cov, lin=lin)
+        return state.with_robot(pose)._replace(cov=cov, lin=lin)
 
     def update(self, state: Joint, scan: Scan, key: Array) -> tuple[Joint, Info]:
         infos = []
@@ -134,6 +144,7 @@ class Localization(Filter):
             if sensor is None:
                 infos.append(info_of_ignored(part))
                 continue
+            sensor = of_robot(sensor, self.motion.state)
             # Padding may hold any number, and is multiplied by zero below.
             part = part._replace(z=jnp.where(part.valid[:, None], part.z, 0.0))
             association, matched = associate_scan(
@@ -158,28 +169,30 @@ class Localization(Filter):
         return state, join_infos(infos, scan.z.shape[1])
 
     def estimate(self, state: Joint) -> Estimate:
-        cov = state.cov
+        cov, n = state.cov, state.robot_size
         if self.chart.basis is not None:
-            basis = self.chart.pose_basis(state.pose)
+            basis = self.robot_chart.pose_basis(state.robot)
             cov = basis @ cov @ basis.T
         return Estimate(
             pose=state.pose,
-            pose_cov=cov,
+            pose_cov=cov if n == 3 else cov[:3, :3],
             points=jax.vmap(self.sensor.position)(state.landmarks),
             point_covs=jnp.zeros((len(state.landmarks), 2, 2), cov.dtype),
             alive=state.alive,
             tag=state.tag,
+            further=state.further,
+            further_cov=None if n == 3 else cov[3:, 3:],
         )
 
 
 def _predict_map(filter: Localization, sensor: Sensor, state: Joint) -> Prediction:
     """The `Prediction` of the map, whose landmarks have no errors: H_i P H_jᵀ by the pose alone."""
 
-    def linearize() -> tuple[Float[Array, "N Z"], Float[Array, "N Z 3"], Float[Array, "N Z Z"]]:
+    def linearize() -> tuple[Float[Array, "N Z"], Float[Array, "N Z R"], Float[Array, "N Z Z"]]:
         every_slot = jnp.arange(len(state.tag))
-        z_hat, h, added_noise = _linearize(filter, sensor, state, every_slot, state.pose)
+        z_hat, h, added_noise = _linearize(filter, sensor, state, every_slot, state.robot)
         if filter.chart.basis is not None:
-            h = h @ filter.chart.pose_basis(state.pose)
+            h = h @ filter.robot_chart.pose_basis(state.robot)
         return z_hat, h, added_noise
 
     def measurements() -> tuple[Float[Array, "N Z"], Float[Array, "N Z Z"]]:
@@ -198,15 +211,15 @@ def _linearize(
     sensor: Sensor,
     state: Joint,
     slot: Int[Array, "m"],
-    pose: Float[Array, "3"],
-) -> tuple[Float[Array, "m Z"], Float[Array, "m Z 3"], Float[Array, "m Z Z"]]:
+    pose: Float[Array, "R"],
+) -> tuple[Float[Array, "m Z"], Float[Array, "m Z R"], Float[Array, "m Z Z"]]:
     """The predicted measurements of landmarks (m,) from a pose, H by its coordinates, and the
     covariance that the linearizer adds to R."""
 
     def observe(
         slot: Int[Array, ""], landmark: Float[Array, "L"]
-    ) -> tuple[Float[Array, "Z"], Float[Array, "Z 3"], Float[Array, "Z Z"]]:
-        point = LinearizationPoint(state, filter.chart, pose, state.cov, slot, landmark)
+    ) -> tuple[Float[Array, "Z"], Float[Array, "Z R"], Float[Array, "Z Z"]]:
+        point = LinearizationPoint(state, filter.robot_chart, pose, state.cov, slot, landmark)
         z_hat, by_pose, _, added_noise = filter.linearize.observe(sensor, point)
         return z_hat, by_pose, added_noise
 
@@ -226,13 +239,13 @@ def _correct(
     `correction.correct`.
     """
     z, slot, matched = measurements
-    chart, (m, size_z) = filter.chart, z.shape
-    pose, xi = state.pose, jnp.zeros_like(state.pose)
+    chart, robot, (m, size_z) = filter.robot_chart, state.robot, z.shape
+    pose, xi = robot, jnp.zeros_like(robot)
     for i in range(filter.iterations):
         z_hat, h, added_noise = _linearize(filter, sensor, state, slot, pose)
         nu, jacobian = jax.vmap(sensor.residual)(z, z_hat), h
         if chart.basis is not None:
-            h = h @ jax.jacfwd(chart.retract_pose, argnums=1)(state.pose, xi)
+            h = h @ jax.jacfwd(chart.retract_pose, argnums=1)(robot, xi)
         if i == 0:
             noise = jax.vmap(partial(predicted_noise, sensor))(z_hat, z, matched) + added_noise
             s_ii = linalg.symmetrize(h @ state.cov @ h.transpose(0, 2, 1) + noise)
@@ -258,7 +271,7 @@ def _correct(
             nu = nu + h @ xi
         correction = correct_gaussian(
             jnp.where(fuse[:, None], nu, 0.0).reshape(-1),
-            jnp.where(fuse[:, None, None], h, 0.0).reshape(-1, 3),
+            jnp.where(fuse[:, None, None], h, 0.0).reshape(-1, len(robot)),
             state.cov,
             scan_noise,
             joseph=filter.covariance == "joseph",
@@ -268,5 +281,5 @@ def _correct(
             log_det, regular = log_det_of_pivots(pivots), (pivots > 0).all(axis=1)
             report = report_fused(prior, fuse, correction.terms.whitened, log_det, regular)
         xi = correction.xi
-        pose = chart.retract_pose(state.pose, xi)
-    return state._replace(pose=pose, cov=correction.cov), report
+        pose = chart.retract_pose(robot, xi)
+    return state.with_robot(pose)._replace(cov=correction.cov), report

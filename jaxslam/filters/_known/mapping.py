@@ -13,7 +13,7 @@ from jaxslam.association._rules import Known
 from jaxslam.charts import Euclidean
 from jaxslam.core._record import field, function_of, record, static
 from jaxslam.core._validation import sensor_model
-from jaxslam.core.protocols import Associate, Filter, Life, Sensor, Wrapper
+from jaxslam.core.protocols import POSE, Associate, Filter, Life, Sensor, Wrapper
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate, Info, Scan
 from jaxslam.core.validation import (
@@ -36,6 +36,7 @@ from jaxslam.filters._particles.slam_particles import (
 )
 from jaxslam.math._arrays import Number
 from jaxslam.math.angles import wrap
+from jaxslam.sensors._suite import conditioned
 
 
 @record
@@ -44,7 +45,8 @@ class Mapping(ParticleMapFilter):
 
     Given the path, landmarks are independent: each has a separate EKF, l ← l + C Hᵀ S⁻¹ ν with
     S = H C Hᵀ + R, and a measurement costs O(1) for any size of the map. This is the map update of
-    one particle of `FastSlam`, without a joint covariance.
+    one particle of `FastSlam`, without a joint covariance. The numbers that the sensor asks for
+    beside the pose (`Sensor.robot`) are known as well, and follow it in the control.
 
     The state is one particle of a `SlamParticles`. `log._replace(control=poses)` makes a log
     of recorded poses (T, 3) and scans; `as_prior` makes the map the initial state of `EkfSlam`.
@@ -66,31 +68,51 @@ class Mapping(ParticleMapFilter):
     """See `EkfSlam.births`."""
     life: Life | None = field(default=None, check=or_none(instance_of(Life)))
     """See `EkfSlam.life`."""
-    controls = ("x [m]", "y [m]", "theta [rad]")
     chart = Euclidean()
+    further = True
 
-    def init(self, pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"]) -> SlamParticles:
+    @property
+    def robot_state(self) -> tuple[str, ...]:
+        return (*POSE, *self.sensor.robot)
+
+    @property
+    def controls(self) -> tuple[str, ...]:
+        return self.robot_state
+
+    def init(self, pose: Float[Array, "R"], pose_cov: Float[Array, "R R"]) -> SlamParticles:
         exact, size = jnp.zeros_like(pose_cov), len(self.sensor.landmark)
+        further = None
+        if self.sensor.robot:
+            pose, further, exact = pose[:3], pose[3:], exact[:3, :3]
         state = initial_slam_particles(pose, exact, 1, self.capacity, size)
         particle: SlamParticles = jax.tree.map(lambda leaf: leaf[0], state._replace(best=None))
+        particle = particle._replace(further=further)
         if self.life is None:
             return particle
         return particle._replace(life=self.life.init(pose, particle.landmarks))
 
-    def predict(self, state: SlamParticles, u: Float[Array, "3"], key: Array) -> SlamParticles:
+    def predict(self, state: SlamParticles, u: Float[Array, "R"], key: Array) -> SlamParticles:
+        if self.sensor.robot:
+            state, u = state._replace(further=u[3:]), u[:3]
         return state._replace(pose=jnp.concatenate([u[:2], wrap(u[2:])]))
 
     def update(self, state: SlamParticles, scan: Scan, key: Array) -> tuple[SlamParticles, Info]:
-        scan = zero_padding(scan)
-        association = associate_particle(self, state, scan)
+        scan, filter = zero_padding(scan), self
+        if self.sensor.robot:
+            filter = dataclasses.replace(self, sensor=conditioned(self.sensor, state.further))
+        association = associate_particle(filter, state, scan)
         # The pose is known, so the proposal does not change it; the other results are used.
-        proposed, innovations = propose_pose(self, state, association, scan)
-        state, info = update_map(self, state, association, innovations, scan)
+        proposed, innovations = propose_pose(filter, state, association, scan)
+        state, info = update_map(filter, state, association, innovations, scan)
         return state, info._replace(log_likelihood=proposed.log_matched)
 
     def estimate(self, state: SlamParticles) -> Estimate:
         believed = slam_estimate(as_only_particle(state), self.sensor)
-        return believed._replace(pose=state.pose, pose_cov=state.pose_cov)
+        believed = believed._replace(pose=state.pose, pose_cov=state.pose_cov)
+        if state.further is None:
+            return believed
+        exact = jnp.zeros((len(state.further),) * 2, state.pose.dtype)
+        return believed._replace(further=state.further, further_cov=exact)
 
 
 @record
@@ -100,12 +122,13 @@ class StartingAt(Wrapper):
     filter: Filter
     state: PyTree
     """independent of the arguments of `init`"""
+    further = True
 
     @property
     def name(self) -> str:  # type: ignore[override]
         return self.filter.name
 
-    def init(self, pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"]) -> PyTree:
+    def init(self, pose: Float[Array, "R"], pose_cov: Float[Array, "R R"]) -> PyTree:
         return jax.tree.map(jnp.asarray, self.state)
 
 

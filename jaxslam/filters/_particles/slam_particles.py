@@ -42,6 +42,8 @@ class SlamParticles(NamedTuple):
     weight zero"""
     life: PyTree = None
     """the memory (P, …) of the filter's `Life`, where it has one"""
+    further: PyTree = None
+    """(k,) numbers of the robot that the sensor of `Mapping` asks for; None where there are none"""
 
 
 def initial_slam_particles(

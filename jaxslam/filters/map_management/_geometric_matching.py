@@ -169,10 +169,13 @@ class _SearchLimits(NamedTuple):
 
 
 def check_point_map(joint: Joint) -> None:
-    """Raise InvalidField unless landmarks are points and the state keeps no earlier poses."""
+    """Raise InvalidField unless landmarks are points, the robot is a pose, and the state keeps no
+    earlier poses."""
     if joint.landmarks.shape[1] != 2:
         size = joint.landmarks.shape[1]
         raise InvalidField("joint", f"expected landmarks (x, y), got {size} parameters each")
+    if joint.further is not None:
+        raise InvalidField("joint", f"expected a pose alone, got {joint.robot_size} numbers of it")
     if jax.tree.leaves(joint.lin):
         raise InvalidField("joint", "a linearizer that keeps former estimates is not supported")
 

@@ -243,7 +243,7 @@ def merge_landmarks(
     # L⁻¹ (0 - δ): what is measured is δ = 0.
     white = linalg.solve_lower(factor, joint.landmarks[j] - joint.landmarks[i])
     xi = linalg.gram(v, white[:, None])[:, 0]
-    pose, landmarks = retract_map(chart, joint, xi)
+    moved = retract_map(chart, joint, xi)
     cov = rows - linalg.gram(v, v)
     if square_root:
         cov = linalg.root_psd(cov)
@@ -251,9 +251,7 @@ def merge_landmarks(
     if together is not None:  # the landmark kept takes over the co-observations of both
         row = together[i] | (ok & (together[i] | together[j]))
         together = together.at[i].set(row).at[:, i].set(row)
-    merged = joint._replace(
-        pose=pose,
-        landmarks=landmarks,
+    merged = moved._replace(
         cov=jnp.where(ok, cov, joint.cov),
         co_observed=together,
     )

@@ -11,7 +11,8 @@ smoothing problem for linear dynamic systems", Automatica 4(2); Fraser & Potter 
 
 No covariance of a motion, of the start or of a pose is inverted, so all may be singular; no prior
 of a landmark is needed, so it does not matter when one is initialized; and covariances are
-sums of squares. O(T N²) time, and O(T N) memory plus a few matrices of N².
+sums of squares. O(T N²) time, and O(T N) memory plus a few matrices of N². A pose has R numbers:
+3, or 3 + E where the state of the motion has E further ones, none of which is an angle.
 """
 
 from typing import NamedTuple
@@ -26,14 +27,14 @@ from jaxslam.math import _linalg as linalg
 from jaxslam.math.angles import wrap
 
 Rows = tuple[Array, Array, Array, Array]
-"""A (Z, 3), B (Z, L) and b (Z,) of a measurement, as in `LinearizedStep`, in units of its
+"""A (Z, R), B (Z, L) and b (Z,) of a measurement, as in `LinearizedStep`, in units of its
 noise; and () bool, whether the covariance of that noise is positive definite."""
 
 
 def whitened_rows(
     sensor: Sensor,
     z: Float[Array, "Z"],
-    pose: Float[Array, "3"],
+    pose: Float[Array, "R"],
     landmark: Float[Array, "L"],
     used: Bool[Array, ""],
     at_landmark: Float[Array, "L"] | None = None,
@@ -52,7 +53,7 @@ def whitened_rows(
     return a, b, r, positive
 
 
-def pose_difference(a: Float[Array, "3"], b: Float[Array, "3"]) -> Float[Array, "3"]:
+def pose_difference(a: Float[Array, "R"], b: Float[Array, "R"]) -> Float[Array, "R"]:
     """The difference a - b of two poses by coordinates, with the angle wrapped."""
     difference = a - b
     return difference.at[2].set(wrap(difference[2]))
@@ -61,9 +62,9 @@ def pose_difference(a: Float[Array, "3"], b: Float[Array, "3"]) -> Float[Array, 
 class Start(NamedTuple):
     """The initial pose δx_0 = L d_0, at a cost of ½ |ξ̄ + d_0|²."""
 
-    root: Float[Array, "3 3"]
+    root: Float[Array, "R R"]
     """L, with L Lᵀ the covariance of the start"""
-    noise: Float[Array, "3"]
+    noise: Float[Array, "R"]
     """ξ̄"""
 
 
@@ -77,17 +78,17 @@ class LinearizedStep(NamedTuple):
     covariances are factors of G. Rows of zeros have no effect. M measurement slots, Z rows each.
     """
 
-    by_pose: Float[Array, "3 3"]
+    by_pose: Float[Array, "R R"]
     """F"""
-    by_noise: Float[Array, "3 W"]
+    by_noise: Float[Array, "R W"]
     """G"""
-    drift: Float[Array, "3"]
+    drift: Float[Array, "R"]
     """c: the pose after the motion from the reference, minus the next reference"""
     noise: Float[Array, "W"]
     """η̄"""
     slot: Int[Array, "M"]
     """slot of the landmark measured; any number where the rows are zeros"""
-    pose_rows: Float[Array, "M Z 3"]
+    pose_rows: Float[Array, "M Z R"]
     """A"""
     landmark_rows: Float[Array, "M Z L"]
     """B"""
@@ -108,7 +109,7 @@ class Gain(NamedTuple):
 
     constant: Float[Array, "W"]
     """k"""
-    by_pose: Float[Array, "W 3"]
+    by_pose: Float[Array, "W R"]
     """J"""
     by_map: Float[Array, "W NL"]
     """K"""
@@ -137,11 +138,11 @@ class Policy(NamedTuple):
 class CostToGo(NamedTuple):
     """The cost to go ½ aᵀ Λ a - aᵀ y + constant, with a = (δpose, δmap)."""
 
-    pose: Float[Array, "3 3"]
+    pose: Float[Array, "R R"]
     """block of Λ; so are the next two"""
-    cross: Float[Array, "3 NL"]
+    cross: Float[Array, "R NL"]
     map: Float[Array, "NL NL"]
-    pose_y: Float[Array, "3"]
+    pose_y: Float[Array, "R"]
     """part of y; so is the next one"""
     map_y: Float[Array, "NL"]
 
@@ -175,6 +176,7 @@ def eliminate_steps(
     leaves Λ - Λ G M⁻¹ Gᵀ Λ and y - Λ G M⁻¹ (Gᵀ y - η̄); then a = F δx + c is substituted.
     """
     wide, kind = capacity * steps.landmark_rows.shape[3], steps.residual.dtype
+    n = steps.by_pose.shape[-1]
 
     def back(
         carry: tuple[CostToGo, Array], step: LinearizedStep
@@ -193,10 +195,10 @@ def eliminate_steps(
         return (before, decrement + gained), gain
 
     no_cost = CostToGo(
-        pose=jnp.zeros((3, 3), kind),
-        cross=jnp.zeros((3, wide), kind),
+        pose=jnp.zeros((n, n), kind),
+        cross=jnp.zeros((n, wide), kind),
         map=jnp.zeros((wide, wide), kind),
-        pose_y=jnp.zeros(3, kind),
+        pose_y=jnp.zeros(n, kind),
         map_y=jnp.zeros(wide, kind),
     )
     end = no_cost, jnp.zeros((), kind)
@@ -213,8 +215,8 @@ def _add_measurements(to_go: CostToGo, step: LinearizedStep, capacity: int) -> C
         """Values (M, …) summed by the slots seen, (N, …)."""
         return jnp.zeros((capacity, *values.shape[1:]), r.dtype).at[step.slot].add(values)
 
-    # AᵀB: (N, 3, L) to (3, NL). BᵀB: a block (L, L) for each slot, at rows and columns of its own.
-    cross = sum_by_slot(jnp.einsum("mzi,mzl->mil", a, b)).transpose(1, 0, 2).reshape(3, -1)
+    # AᵀB: (N, R, L) to (R, NL). BᵀB: a block (L, L) for each slot, at rows and columns of its own.
+    cross = sum_by_slot(jnp.einsum("mzi,mzl->mil", a, b)).transpose(1, 0, 2).reshape(a.shape[2], -1)
     rows = jnp.arange(capacity)[:, None] * size + jnp.arange(size)[None, :]
     diagonal = sum_by_slot(jnp.einsum("mzk,mzl->mkl", b, b))
     return CostToGo(
@@ -227,7 +229,7 @@ def _add_measurements(to_go: CostToGo, step: LinearizedStep, capacity: int) -> C
 
 
 def _eliminate_noise(
-    to_go: CostToGo, by_noise: Float[Array, "3 W"], noise: Float[Array, "W"]
+    to_go: CostToGo, by_noise: Float[Array, "R W"], noise: Float[Array, "W"]
 ) -> tuple[CostToGo, Gain, Float[Array, ""]]:
     """The cost to go at a + G d minimized over d; the gain of the best d, and its term of λ²."""
     g_lambda = linalg.gram(by_noise, to_go.pose)  # Gᵀ Λ
@@ -255,11 +257,11 @@ def _solve_upper(factor: Array, rhs: Array) -> Array:
 
 def chain_marginals(
     chain: Chain, policy: Policy
-) -> tuple[Float[Array, "poses 3"], Float[Array, "poses 3 3"], Float[Array, "D D"]]:
-    """The marginals of a chain, in O(T N) plus one triangular system of 3T columns.
+) -> tuple[Float[Array, "poses R"], Float[Array, "poses R R"], Float[Array, "D D"]]:
+    """The marginals of a chain, in O(T N) plus one triangular system of R T columns.
 
     They are δx from the start on, the covariance of each pose, and the joint covariance of the last
-    pose and the map, D = 3 + NL, with unit variance at dead slots.
+    pose and the map, D = R + NL, with unit variance at dead slots.
 
     With n standard normal and M = R Rᵀ the matrix of the gain,
 
@@ -304,10 +306,10 @@ def chain_marginals(
     if wide == 0:
         return path, pose_covs, pose_covs[-1]
     # Σ = L⁻ᵀ L⁻¹ with the factor L of the map: T_t Σ T_tᵀ is the square of L⁻¹ T_tᵀ. All T_t
-    # together are one right-hand side of 3T columns.
-    poses = path.shape[0]
-    spread = linalg.solve_lower(policy.map_factor, by_map.reshape(poses * 3, wide).T)
-    spread = spread.reshape(wide, poses, 3)
+    # together are one right-hand side of R T columns.
+    poses, n = path.shape
+    spread = linalg.solve_lower(policy.map_factor, by_map.reshape(poses * n, wide).T)
+    spread = spread.reshape(wide, poses, n)
     covs = pose_covs + jnp.einsum("nti,ntj->tij", spread, spread)
     unit = linalg.solve_lower(policy.map_factor, jnp.eye(wide, dtype=pose_covs.dtype))
     of_map = unit.T @ unit

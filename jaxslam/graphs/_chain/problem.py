@@ -30,9 +30,9 @@ from jaxslam.math.angles import wrap
 class Problem(NamedTuple):
     """The data of the problem: prior, controls and the measurements used."""
 
-    pose: Float[Array, "3"]
+    pose: Float[Array, "R"]
     """mean of the start"""
-    root: Float[Array, "3 3"]
+    root: Float[Array, "R R"]
     """L, with L Lᵀ the covariance of the start"""
     control: Float[Array, "T U"]
     roots: Float[Array, "T W W"]
@@ -45,11 +45,11 @@ class Problem(NamedTuple):
 class Iterate(NamedTuple):
     """Values of all unknowns, and the resulting path."""
 
-    start: Float[Array, "3"]
+    start: Float[Array, "R"]
     """ξ"""
     noise: Float[Array, "T W"]
     """η"""
-    path: Float[Array, "T+1 3"]
+    path: Float[Array, "T+1 R"]
     """from the start on: x_0 = pose + L ξ, x_t = f(x_{t-1}, u_t, Q^{1/2} η_t)"""
     landmarks: Float[Array, "N L"]
 

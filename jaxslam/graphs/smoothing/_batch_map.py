@@ -22,21 +22,22 @@ from jaxslam.graphs.smoothing._smoother import (
     start_of,
     with_singular,
 )
+from jaxslam.sensors._suite import of_robot
 
 
 class BatchSolution(NamedTuple):
     """The `final` of the trace of `BatchMap`."""
 
-    start: Float[Array, "3"]
-    """pose before the first control"""
-    start_cov: Float[Array, "3 3"]
+    start: Float[Array, "R"]
+    """pose before the first control, with the further numbers of the robot"""
+    start_cov: Float[Array, "R R"]
     joint: Joint
     """the last pose and the map, a possible initial state of a filter"""
     regular: Bool[Array, ""]
     """the information on the map is positive definite; otherwise covariances are invalid"""
     filtered: Estimate
     """estimates of the filter that gave the initial path, with leading T"""
-    start_noise: Float[Array, "3"]
+    start_noise: Float[Array, "R"]
     """ξ, the start's error in standard deviations: start = pose + P0^{1/2} ξ"""
     noise: Float[Array, "T W"]
     """η, the noises of the motions in standard deviations: w = Q^{1/2} η"""
@@ -104,7 +105,8 @@ class BatchMap(LogEstimator):
             )
 
     def solve(self, log: Log, key: Array) -> Trace:
-        motion, sensor, passed = self.motion, self.sensor, self._forward(log, key)
+        motion, passed = self.motion, self._forward(log, key)
+        sensor = of_robot(self.sensor, motion.state)
         log = log_in_one_dtype(log)
         kind = log.control.dtype
         mean, cov = jnp.asarray(self.pose, kind), jnp.asarray(self.pose_cov, kind)

@@ -13,10 +13,25 @@ from jaxslam.association._rules import Known
 from jaxslam.core._numbers import as_array
 from jaxslam.core._record import check_field, field, function_of, record, static
 from jaxslam.core._validation import motion_model, sensor_model
-from jaxslam.core.protocols import Associate, Component, Filter, Motion, Sensor, Wrapper
+from jaxslam.core.protocols import (
+    Associate,
+    Component,
+    Filter,
+    Motion,
+    Sensor,
+    Wrapper,
+    sensor_of_robot,
+)
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate, Info, Log, Scan, Trace
-from jaxslam.core.validation import InvalidField, at_least, or_none, probability, refusals_of
+from jaxslam.core.validation import (
+    InvalidField,
+    at_least,
+    or_none,
+    probability,
+    refusals_of,
+    require,
+)
 from jaxslam.filters._ekf.ekf_slam import EkfSlam
 from jaxslam.math._arrays import Number
 from jaxslam.math._xla import hot_jit
@@ -28,13 +43,13 @@ class ForwardPass(NamedTuple):
 
     trace: Trace
     """the filter's own, its `final` a `slots.Joint`"""
-    before: Float[Array, "T 3"]
-    """the pose from which each motion was linearized"""
-    predicted: Float[Array, "T 3"]
+    before: Float[Array, "T R"]
+    """the pose, or robot, from which each motion was linearized"""
+    predicted: Float[Array, "T R"]
     """the pose after the motion, at which measurements of the map were linearized"""
     predicted_map: Float[Array, "T N L"]
     """the map before the scan"""
-    corrected: Float[Array, "T 3"]
+    corrected: Float[Array, "T R"]
     """the pose after the scan, where new landmarks were linearized"""
     corrected_map: Float[Array, "T N L"]
     """the map after the scan"""
@@ -54,6 +69,7 @@ class _Forward(Wrapper):
     """The EKF-SLAM of a forward pass, which keeps its linearization points; state `_State`."""
 
     filter: Filter
+    further = True
 
     def init(self, pose: Array, pose_cov: Array) -> _State:
         joint = self.filter.init(pose, pose_cov)
@@ -61,7 +77,7 @@ class _Forward(Wrapper):
 
     def predict(self, state: _State, u: Array, key: Array) -> _State:
         joint = self.filter.predict(state.joint, u, key)
-        return _State(joint, state.joint.pose, joint.pose, joint.landmarks)
+        return _State(joint, state.joint.robot, joint.robot, joint.landmarks)
 
     def update(self, state: _State, scan: Scan, key: Array) -> tuple[_State, Info]:
         joint, info = self.filter.update(state.joint, scan, key)
@@ -91,7 +107,7 @@ class LogEstimator(Component):
     A subclass is a record that defines `solve`. Called with (log, key) it gives a `Trace`. Raises
     ValueError as `EkfSlam` does, and for sensors that it does not support: a suite, landmarks that
     become points, or landmarks with parameters that are exact given the pose (the anchor of a ray);
-    and, when called, as `run` does.
+    for further angles in the state of the motion; and, when called, as `run` does.
     """
 
     motion: Motion = field(check=motion_model)
@@ -100,9 +116,10 @@ class LogEstimator(Component):
     capacity: int = static(check=at_least(1))
     """landmark slots N"""
     pose: ArrayLike = dataclasses.field()
-    """(3,) of the robot before the first control"""
+    """(3,) of the robot before the first control; of a motion model with E further numbers in its
+    state, of all R = 3 + E"""
     pose_cov: ArrayLike = dataclasses.field()
-    """(3, 3)"""
+    """(R, R)"""
     _: dataclasses.KW_ONLY
     associate: Associate = field(default=Known(), check=function_of("prediction", "scan"))
     """See `EkfSlam.associate`."""
@@ -125,6 +142,10 @@ class LogEstimator(Component):
                 "expected landmarks that measurement and prior determine, got "
                 f"{sensor.landmark} of {sensor.name}",
             )
+        require("sensor", sensor, sensor_of_robot(self.motion.state))
+        if angles := [name for name in self.motion.state[3:] if name.endswith("[rad]")]:
+            reason = f"expected further states that are no angles, got {', '.join(angles)}"
+            raise InvalidField("motion", reason)
         for start in ("pose", "pose_cov"):
             check_field(self, start, as_array)
         self._check(LogEstimator, {"solve": "log, key"})
@@ -147,7 +168,7 @@ class LogEstimator(Component):
 
         def linearized_at(state: _State) -> tuple[Array, ...]:
             joint = state.joint
-            return state.before, state.predicted, state.predicted_map, joint.pose, joint.landmarks
+            return state.before, state.predicted, state.predicted_map, joint.robot, joint.landmarks
 
         trace = run(self._filter, log, self.pose, self.pose_cov, key, probe=linearized_at)
         return ForwardPass(trace._replace(final=trace.final.joint, probe=None), *trace.probe)

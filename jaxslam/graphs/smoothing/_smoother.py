@@ -30,6 +30,7 @@ from jaxslam.graphs.smoothing._forward_pass import ForwardPass, LogEstimator, lo
 from jaxslam.linearize import _first_order as first_order
 from jaxslam.math import _linalg as linalg
 from jaxslam.math.angles import wrap
+from jaxslam.sensors._suite import of_robot
 
 
 def noise_roots(
@@ -40,9 +41,9 @@ def noise_roots(
     return jax.vmap(linalg.root_psd)(cov)
 
 
-def start_of(pose_cov: Float[Array, "3 3"]) -> Start:
+def start_of(pose_cov: Float[Array, "R R"]) -> Start:
     """The start of a chain at the mean of the prior."""
-    return Start(linalg.root_psd(pose_cov), jnp.zeros(3, pose_cov.dtype))
+    return Start(linalg.root_psd(pose_cov), jnp.zeros(len(pose_cov), pose_cov.dtype))
 
 
 def chain_of(
@@ -50,7 +51,7 @@ def chain_of(
     sensor: Sensor,
     passed: ForwardPass,
     log: Log,
-    pose_cov: Float[Array, "3 3"],
+    pose_cov: Float[Array, "R R"],
     roots: Float[Array, "T W W"],
 ) -> tuple[Chain, Bool[Array, "T M"]]:
     """The filter's linear system about its path and final map, and which measurements it uses.
@@ -116,7 +117,7 @@ def _linearize_measurements(
     return slot, *jax.vmap(over_slots)(z, slot, fused, new, at)
 
 
-def _new_landmark_rows(sensor: Sensor, z: Float[Array, "Z"], pose: Float[Array, "3"]) -> Rows:
+def _new_landmark_rows(sensor: Sensor, z: Float[Array, "Z"], pose: Float[Array, "R"]) -> Rows:
     """The rows of a new landmark: C^{-1/2} times -G_pose, I and 0, C = G_z R G_zᵀ + G_s S G_sᵀ."""
     size = len(sensor.landmark)
     mean, cov_s = (jnp.asarray(part, z.dtype) for part in sensor.free)
@@ -131,9 +132,9 @@ def _new_landmark_rows(sensor: Sensor, z: Float[Array, "Z"], pose: Float[Array, 
 class Smoothed(NamedTuple):
     """The `final` of a smoother's trace."""
 
-    start: Float[Array, "3"]
-    """pose before the first control"""
-    start_cov: Float[Array, "3 3"]
+    start: Float[Array, "R"]
+    """pose before the first control, with the further numbers of the robot"""
+    start_cov: Float[Array, "R R"]
     joint: Joint
     """the last pose and the map, a possible initial state of a filter"""
     regular: Bool[Array, ""]
@@ -170,11 +171,12 @@ class Smoother(LogEstimator):
         kind = log.control.dtype
         mean, cov = jnp.asarray(self.pose, kind), jnp.asarray(self.pose_cov, kind)
         roots = noise_roots(self.motion, passed, log.control)
-        chain, used = chain_of(self.motion, self.sensor, passed, log, cov, roots)
+        sensor = of_robot(self.sensor, self.motion.state)
+        chain, used = chain_of(self.motion, sensor, passed, log, cov, roots)
         final = passed.trace.final
         policy = eliminate(chain, final.alive)
         path = jnp.concatenate([mean[None], passed.corrected])
-        estimate, smoothed = solution(self.sensor, chain, policy, path, final, passed)
+        estimate, smoothed = solution(sensor, chain, policy, path, final, passed)
         return Trace(estimate, with_singular(passed.trace.info, used), smoothed, None)
 
 
@@ -182,7 +184,7 @@ def solution(
     sensor: Sensor,
     chain: Chain,
     policy: Policy,
-    path: Float[Array, "poses 3"],
+    path: Float[Array, "poses R"],
     joint: Joint,
     passed: ForwardPass,
 ) -> tuple[Estimate, Smoothed]:
@@ -191,11 +193,19 @@ def solution(
     poses = path + deviation
     poses = poses.at[:, 2].set(wrap(poses[:, 2]))
     landmarks = jnp.where(joint.alive[:, None], joint.landmarks + policy.landmarks, 0.0)
-    last = joint._replace(pose=poses[-1], landmarks=landmarks, cov=last_cov)
+    last = joint.with_robot(poses[-1])._replace(landmarks=landmarks, cov=last_cov)
     at_end = estimate_of(last, sensor, Euclidean())
     steps = path.shape[0] - 1
     always = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (steps, *leaf.shape)), at_end)
-    estimate = always._replace(pose=poses[1:], pose_cov=covs[1:])
+    if poses.shape[1] == 3:
+        estimate = always._replace(pose=poses[1:], pose_cov=covs[1:])
+    else:
+        estimate = always._replace(
+            pose=poses[1:, :3],
+            pose_cov=covs[1:, :3, :3],
+            further=poses[1:, 3:],
+            further_cov=covs[1:, 3:, 3:],
+        )
     filtered = passed.trace.estimate
     return estimate, Smoothed(poses[0], covs[0], last, policy.regular, filtered)
 

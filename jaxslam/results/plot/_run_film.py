@@ -78,7 +78,7 @@ def probe(state: PyTree) -> Cloud | Links | Hypotheses | None:
         slots = jnp.arange(state.alive.shape[0], dtype=jnp.int32)
         return _links(local_information(state, slots), 2)
     if isinstance(state, CanonicalState):
-        return _links(state.omega, state.landmarks.shape[1])
+        return _links(state.omega, state.landmarks.shape[1], len(state.pose))
     if isinstance(state, DelayedState):
         # The hypotheses are after the slots of the landmarks, before the stored poses.
         joint, count = state.joint, state.persistence.shape[0]
@@ -90,11 +90,12 @@ def probe(state: PyTree) -> Cloud | Links | Hypotheses | None:
     return None
 
 
-def _links(omega: Float[Array, "D D"], size: int) -> Links:
-    """The links of Ω of a robot and landmarks of `size` parameters."""
+def _links(omega: Float[Array, "D D"], size: int, robot: int = 3) -> Links:
+    """The links of Ω of a robot of so many numbers and landmarks of `size` parameters."""
     # NumPy's arrays are constants, and cost no operation. Row 0 of `rows` is the robot's position,
     # row 1 + slot the position of a landmark, whose parameters begin with it.
-    landmarks = 3 + np.arange((omega.shape[0] - 3) // size)[:, None] * size + np.arange(2)
+    count = (omega.shape[0] - robot) // size
+    landmarks = robot + np.arange(count)[:, None] * size + np.arange(2)
     rows = np.concatenate([np.arange(2)[None], landmarks])
     blocks = omega[rows[:, None, :, None], rows[None, :, None, :]]  # (K, K, 2, 2)
     norm = jnp.sqrt((blocks**2).sum(axis=(2, 3)))
@@ -269,7 +270,7 @@ def run_film(
             f"animate: expected a true path of shape ({steps}, 3), got {np.shape(true_path)}"
         )
     true = None if true_path is None else np.asarray(true_path, float)
-    pose, pose_cov, points, covs, alive, _ = map(np.asarray, history.estimate)
+    pose, pose_cov, points, covs, alive, _ = map(np.asarray, history.estimate[:6])
     pose_cov = pose_cov[:, :2, :2]
     beams, counts = beams_of(history)
     without = (np.isnan(ellipses(m[a], c[a])) for m, c, a in zip(points, covs, alive, strict=True))

@@ -7,10 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from jaxslam.core.protocols import POSE
 from jaxslam.core.types import Beams
 from jaxslam.laser.grids._grid import Grid
 from jaxslam.laser.grids.beam_models._beam_model import BeamModel
-from jaxslam.verify._inputs.functions import POSE, Argument, Function
+from jaxslam.verify._inputs.functions import Argument, Function
 from jaxslam.verify._inputs.samples import Samples
 
 FAR = 40.0

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 
 from jaxslam.core._names import unfit_signature
 from jaxslam.core._record import set_field
-from jaxslam.core.protocols import Motion, Sensor
+from jaxslam.core.protocols import POSE, Motion, Sensor
 from jaxslam.core.validation import InvalidField, refusals_of
 from jaxslam.graphs import Factor
 
@@ -73,7 +73,6 @@ def split_claim(
     return list(claim)
 
 
-POSE = ("x [m]", "y [m]", "theta [rad]")
 _POINT = ("x [m]", "y [m]")
 _GLOSSARY = {
     "pose": POSE,
@@ -131,11 +130,11 @@ def periods(names: Sequence[str]) -> Float[np.ndarray, "m"]:
 def motion_functions(motion: Motion) -> tuple[Function]:
     """The function of a motion model: `step` by pose, control and noise."""
     arguments = (
-        Argument("pose", POSE),
+        Argument("pose", motion.state),
         Argument("control", motion.controls),
         Argument("noise", motion.noises, scale=0.1),
     )
-    return (Function("step", motion.step, arguments, POSE, motion.jacobians),)
+    return (Function("step", motion.step, arguments, motion.state, motion.jacobians),)
 
 
 def with_signature_errors(model: Motion | Sensor) -> Motion | Sensor:
@@ -163,7 +162,7 @@ def with_signature_errors(model: Motion | Sensor) -> Motion | Sensor:
 
 def sensor_functions(sensor: Sensor) -> tuple[Function, Function]:
     """The functions of a sensor: `observe` by (pose, landmark), `invert` by (pose, z, s)."""
-    pose, landmark = Argument("pose", POSE), Argument("landmark", sensor.landmark)
+    pose, landmark = robot_argument(sensor), Argument("landmark", sensor.landmark)
     free = tuple(f"s[{k}]" for k in range(len(sensor.free.mean)))
     inverse = (pose, Argument("measurement", sensor.measurements), Argument("free", free))
     return (
@@ -176,6 +175,11 @@ def sensor_functions(sensor: Sensor) -> tuple[Function, Function]:
         ),
         Function("invert", sensor.invert, inverse, sensor.landmark, sensor.invert_jacobians),
     )
+
+
+def robot_argument(sensor: Sensor) -> Argument:
+    """The pose as a sensor gets it: with the further numbers of the robot that it asks for."""
+    return Argument("pose", (*POSE, *sensor.robot))
 
 
 def factor_function(factor: Factor) -> Function:

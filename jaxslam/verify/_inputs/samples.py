@@ -7,9 +7,9 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxslam.core.protocols import Sensor
+from jaxslam.core.protocols import POSE, Sensor
 from jaxslam.math._xla import quick_jit
-from jaxslam.verify._inputs.functions import POSE, Argument, periods
+from jaxslam.verify._inputs.functions import Argument, periods, robot_argument
 
 Values: TypeAlias = Float[np.ndarray, "_ _"]
 """States (S, n) of one argument."""
@@ -102,9 +102,10 @@ def sensor_samples(sensor: Sensor, count: int, seed: int) -> tuple[Samples, Samp
     place = quick_jit(jax.vmap(sensor.invert))
 
     def at(poses: Values, points: Values) -> Values:
-        return np.asarray(embed(poses, points), np.float64)
+        return np.asarray(embed(poses[:, :3], points), np.float64)
 
-    pose = _sampled_argument(rng, Argument("pose", POSE), count)
+    robot = robot_argument(sensor)
+    pose = _sampled_argument(rng, robot, count)
     elsewhere = _sampled_argument(rng, Argument("pose", POSE), count)
     offset = rng.normal(size=(count, 2)) * 4
     first = pose.copy()
@@ -112,7 +113,7 @@ def sensor_samples(sensor: Sensor, count: int, seed: int) -> tuple[Samples, Samp
     landmark = at(elsewhere, pose[:, :2] + offset)
     base = (pose, landmark)
     groups: list[_Group] = [("random", base)]
-    for k, argument in enumerate((Argument("pose", POSE), Argument("landmark", sensor.landmark))):
+    for k, argument in enumerate((robot, Argument("landmark", sensor.landmark))):
         groups += list(_one_at_a_time(base, k, argument))
 
     mean = np.asarray(sensor.free.mean, np.float64)
@@ -143,7 +144,7 @@ def sensor_samples(sensor: Sensor, count: int, seed: int) -> tuple[Samples, Samp
     observed = _concatenate(groups)
 
     back: list[_Group] = [("random", (pose, z, s))]
-    back += list(_one_at_a_time((pose, z, s), 0, Argument("pose", POSE)))
+    back += list(_one_at_a_time((pose, z, s), 0, robot))
     seen = np.asarray(quick_jit(jax.vmap(sensor.observe))(*observed.values), np.float64)
     reached = _reach(seen, sensor)
     difficult = _one_at_a_time((pose, z, s), 1, Argument("measurement", sensor.measurements))
