@@ -164,7 +164,7 @@ def _sizes(
     yield _largest("NIS / dof of a landmark", run, index, [str(slot) for slot in slots])
     yield Statistic("NIS trend", "", *2 * (_correlation(run.nis, time[run.row]),))
     window = np.zeros(len(time), int)
-    for k in range(WINDOWS):
+    for k in range(0, WINDOWS, 2):  # tenths that do not overlap
         window[window_rows(len(time), k)] = k
     yield _largest("NIS / dof of a time", run, window[run.row], [str(k) for k in range(WINDOWS)])
 

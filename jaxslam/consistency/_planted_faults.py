@@ -24,8 +24,11 @@ from jaxslam.math import se2
 from jaxslam.math.angles import wrap
 from jaxslam.simulation._twin import Twin
 
-WINDOWS = 10
-"""Parts of the log, in time, in each of which a slip is looked for."""
+HALVES = 20
+"""Parts of the log, in time, in each of which a slip is planted."""
+
+WINDOWS = HALVES - 1
+"""Tenths of the log, each of two successive parts, in each of which a slip is looked for."""
 
 
 class Amounts(NamedTuple):
@@ -168,21 +171,26 @@ def faults_of(world: Twin) -> tuple[list[Fault], bool]:
 def planted_logs(world: Twin, faults: Sequence[Fault], slips: bool) -> tuple[Truth, Log]:
     """The noise-free truth, and the logs (1 + F, …): without a fault, with each, with each slip."""
     dtype, steps = jnp.result_type(float), world.steps
-    count = 1 + len(faults) + WINDOWS * slips
+    count = 1 + len(faults) + HALVES * slips
     none: PyTree = {name: np.zeros(count, dtype) for name in Amounts._fields}
     none["slip"] = np.zeros((count, steps), dtype)
     for i, fault in enumerate(faults):
         none[fault.name][1 + i] = fault.amount
-    for k in range(WINDOWS * slips):
-        none["slip"][1 + len(faults) + k, window_rows(steps, k)] = _SLIP.amount
+    for k in range(HALVES * slips):
+        none["slip"][1 + len(faults) + k, _rows(steps, k, k + 1)] = _SLIP.amount
     truth, logs = _plant(world, columns_of(world), Amounts(**none))
     return truth, logs
 
 
 def window_rows(steps: int, k: int) -> slice:
-    """The rows of part k of `WINDOWS`."""
-    edges = np.linspace(0, steps, WINDOWS + 1).round().astype(int)
-    return slice(int(edges[k]), int(edges[k + 1]))
+    """The rows of tenth k of `WINDOWS`."""
+    return _rows(steps, k, k + 2)
+
+
+def _rows(steps: int, first: int, last: int) -> slice:
+    """The rows from part `first` to part `last` of `HALVES`, that excluded."""
+    edges = np.linspace(0, steps, HALVES + 1).round().astype(int)
+    return slice(int(edges[first]), int(edges[last]))
 
 
 @partial(jax.jit, static_argnames="columns")
@@ -252,16 +260,21 @@ def shapes_of(
         innovations: (1 + F, T, M, Z) of the filter over `planted_logs`, 0 where it fused nothing.
         covs: (T, M, Z, Z) S of the run without a fault.
     """
-    planted = [*faults, *[_SLIP] * (WINDOWS * slips)]
     fused = np.diagonal(covs, axis1=-2, axis2=-1).all(axis=-1)
     inverse = np.zeros_like(covs)
     inverse[fused] = np.linalg.inv(covs[fused])
-    shapes = []
-    for fault, of_run in zip(planted, innovations[1:], strict=True):
-        change = np.where(fused[..., None], of_run - innovations[0], 0.0) / fault.amount
+
+    def shape_of(fault: Fault, change: np.ndarray) -> Shape:
+        change = np.where(fused[..., None], change, 0.0) / fault.amount
         weights = np.einsum("tmij,tmj->tmi", inverse, change)
-        shapes.append(Shape(fault, weights, float(np.sum(weights * change))))
+        return Shape(fault, weights, float(np.sum(weights * change)))
+
+    changes = innovations[1:] - innovations[0]
+    of_faults = [shape_of(*pair) for pair in zip(faults, changes, strict=False)]
+    halves = changes[len(faults) :]
+    # To first order a slip of two parts does what one in each does.
+    of_slips = [shape_of(_SLIP, halves[k] + halves[k + 1]) for k in range(WINDOWS * slips)]
     return (
-        [shape for shape in shapes[: len(faults)] if shape.information > 0],
-        [shape for shape in shapes[len(faults) :] if shape.information > 0],
+        [shape for shape in of_faults if shape.information > 0],
+        of_slips if all(shape.information > 0 for shape in of_slips) else [],
     )

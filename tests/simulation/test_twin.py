@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from cases import refused
 
-from jaxslam import association, catalog, consistency, monte_carlo, motion, run, smoothing
+from jaxslam import association, catalog, consistency, monte_carlo, motion, run, sensors, smoothing
 from jaxslam.core.types import Status
 from jaxslam.simulation import Twin, spurious, twin
 
@@ -164,6 +164,19 @@ def test_without_tags_the_associated_landmarks_are_drawn():
     points = np.asarray(like.landmarks)
     nearest = np.hypot(*(points[:, None] - drawn_logs.POSTS[None]).transpose(2, 0, 1)).min(axis=1)
     assert np.sort(nearest)[:6].max() < 0.3
+
+
+@pytest.mark.sweep
+def test_ranges_alone_are_smoothed_from_the_odometry():
+    """Where the posts are is not known beforehand; the optimum has the likelihood of the truth."""
+    world = drawn_logs.yard(steps=150)
+    sensor = sensors.RangeOnly(np.array([[0.05**2]]), mount=(0.2, 0.0, 0.1))
+    data = drawn_logs.drawn(dataclasses.replace(world, sensor=sensor, filter_options={}))
+    like = twin(data)
+    far = np.hypot(*(np.asarray(like.landmarks) - drawn_logs.POSTS).T)
+    assert far.max() < 0.5
+    _, log = draws(like, 10)
+    np.testing.assert_array_equal(log.scan.valid[3], data.log.scan.valid)
 
 
 def test_outliers_are_put_in_where_they_are_wanted():
