@@ -61,6 +61,13 @@ class Statistic(NamedTuple):
         return f"{self.family}, {self.detail}" if self.detail else self.family
 
 
+def fused_of(info: Info) -> Bool[np.ndarray, "*runs T M"]:
+    """Which measurements a filter fused, with an innovation whose covariance is known."""
+    variances = np.diagonal(np.asarray(info.innovation_cov), axis1=-2, axis2=-1)
+    fused: np.ndarray = (np.asarray(info.status) == Status.FUSED) & (variances > 0).all(axis=-1)
+    return fused
+
+
 class FusedInnovations(NamedTuple):
     """The fused measurements of a run, in the order of rows and slots."""
 
@@ -81,7 +88,7 @@ class FusedInnovations(NamedTuple):
         cls, info: Info, z: Float[np.ndarray, "T M Z"], sensor_names: tuple[str, ...]
     ) -> "FusedInnovations":
         """The fused innovations among the infos of a run whose scans had z."""
-        fused = np.asarray(info.status) == Status.FUSED
+        fused = fused_of(info)
         row = np.nonzero(fused)[0]
         nu = np.asarray(info.innovation, np.float64)[fused]
         cov = np.asarray(info.innovation_cov, np.float64)[fused]
@@ -203,7 +210,7 @@ def _tails(run: FusedInnovations, sensor: Sensor) -> Iterator[Statistic]:
 
 def _faults(info: Info, shapes: tuple[list[Shape], list[Shape]]) -> Iterator[Statistic]:
     """The amount of each fault, and the slip of the part of the log in which it is clearest."""
-    fused = np.asarray(info.status) == Status.FUSED
+    fused = fused_of(info)
     innovation = np.where(fused[..., None], np.asarray(info.innovation, np.float64), 0.0)
     faults, slips = shapes
     for shape in faults:

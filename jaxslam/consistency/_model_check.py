@@ -19,7 +19,13 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Float, PyTree
 
 from jaxslam.consistency._intervals import LEVEL
-from jaxslam.consistency._log_statistics import GENERAL, Rates, Statistic, statistics_of
+from jaxslam.consistency._log_statistics import (
+    GENERAL,
+    Rates,
+    Statistic,
+    fused_of,
+    statistics_of,
+)
 from jaxslam.consistency._planted_faults import (
     Shape,
     faults_of,
@@ -34,7 +40,7 @@ from jaxslam.core._record import as_record
 from jaxslam.core._validation import log_of
 from jaxslam.core.logs._tables import INTERVAL, split_unit
 from jaxslam.core.protocols import Filter, Motion
-from jaxslam.core.types import Info, Log, Scan, Status, Truth
+from jaxslam.core.types import Info, Log, Scan, Truth
 from jaxslam.core.validation import (
     InvalidField,
     at_least,
@@ -210,12 +216,12 @@ def check_models(
     count = len(logs.control)
     total = twins + count
     infos = runs.of_logs(truth, logs)
+    fused = fused_of(infos)
     with refusals_of("check_models"):
-        if not np.asarray(infos.dof).any():
+        if not fused.any():
             raise InvalidField("filter", "expected one with innovations, got none in its Info")
     if progress is not None:
         progress(count, total)
-    fused = np.asarray(infos.status) == Status.FUSED
     innovations = np.where(fused[..., None], np.asarray(infos.innovation, np.float64), 0.0)
     covs = np.asarray(infos.innovation_cov, np.float64)[1]
     shapes = shapes_of(faults, slips, innovations[1:], np.where(fused[1, ..., None, None], covs, 0))
