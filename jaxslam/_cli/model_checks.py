@@ -93,16 +93,16 @@ def summary_of(check: ModelCheck) -> Json:
         "findings": list(check.findings),
         "statistics": [
             {
-                "statistic": each.statistic.name,
-                "log": json_number(each.statistic.value),
-                "twins": [json_number(value) for value in each.twins],
-                "twins below": each.rank,
-                "p": each.p,
-                "p corrected": each.corrected,
-                "distance": json_number(each.distance),
-                "finding": each.finding if each.contradicts else "",
+                "statistic": row.statistic.name,
+                "log": json_number(row.statistic.value),
+                "twins": [json_number(value) for value in row.twins],
+                "twins below": row.rank,
+                "p": row.p,
+                "p corrected": row.corrected,
+                "distance": json_number(row.distance),
+                "finding": row.finding if row.contradicts else "",
             }
-            for each in check.statistics
+            for row in check.statistics
         ],
     }
 

@@ -132,13 +132,13 @@ def statistics_of(
         shapes: of the faults, and of slips in parts of the log.
     """
     run = FusedInnovations.of(info, z, sensor.measurements)
-    found = [*_sizes(run, sensor, rates, time), *_correlations(run, sensor, rates)]
-    found += [*_tails(run, sensor), *_faults(info, shapes)]
+    statistics = [*_sizes(run, sensor, rates, time), *_correlations(run, sensor, rates)]
+    statistics += [*_tails(run, sensor), *_faults(info, shapes)]
     rejected = int((np.asarray(info.status) == Status.REJECTED).sum())
-    found.append(_count("rejected by the gate", "", rejected, max(int(valid.sum()), 1)))
+    statistics.append(_count("rejected by the gate", "", rejected, max(int(valid.sum()), 1)))
     likelihood = float(np.asarray(info.log_likelihood, np.float64).sum())
-    found.append(Statistic("log-likelihood", "", likelihood, likelihood))
-    return found
+    statistics.append(Statistic("log-likelihood", "", likelihood, likelihood))
+    return statistics
 
 
 def _sizes(

@@ -114,7 +114,7 @@ class ModelCheck:
     @property
     def findings(self) -> tuple[str, ...]:
         """What contradicts the models, worst first; () where nothing does."""
-        return tuple(each.finding for each in self.statistics if each.contradicts)
+        return tuple(row.finding for row in self.statistics if row.contradicts)
 
     def __repr__(self) -> str:
         return (
@@ -133,15 +133,15 @@ class ModelCheck:
                 f"  {self.left_out:,} measurements have no landmark in the smoothed map, and no "
                 "twin; if the filter was lost there, path and map of the twins are too"
             )
-        found = [each for each in self.statistics if each.contradicts]
-        if not found:
+        rejected = [row for row in self.statistics if row.contradicts]
+        if not rejected:
             return "\n".join(
                 [*lines, "  nothing in these statistics contradicts the models (p > 0.05, Holm)"]
             )
-        for each in found:
-            p = "p < 0.0001" if each.corrected < 1e-4 else f"p = {each.corrected:.2g}"
-            lines.append(f"  {each.finding} ({p})")
-        fit = len(self.statistics) - len(found)
+        for row in rejected:
+            p = "p < 0.0001" if row.corrected < 1e-4 else f"p = {row.corrected:.2g}"
+            lines.append(f"  {row.finding} ({p})")
+        fit = len(self.statistics) - len(rejected)
         return "\n".join([*lines, f"  the other {fit} fit (p > 0.05, Holm)"])
 
 
@@ -204,9 +204,9 @@ def check_models(
     runs = _Runs(world, filter, key, devices, block, check_dtype(dtype))
     faults, slips = faults_of(world)
     truth, planted = jax.device_get(planted_logs(world, faults, slips))
-    own = jax.tree.map(lambda leaf: np.asarray(leaf)[None], log)
+    recorded = jax.tree.map(lambda leaf: np.asarray(leaf)[None], log)
     logs = jax.tree.map(
-        lambda one, rest: np.concatenate([one.astype(rest.dtype), rest]), own, planted
+        lambda log, rest: np.concatenate([log.astype(rest.dtype), rest]), recorded, planted
     )
     if world.spurious is not None:  # the slots of clutter, which the twins have
         spare = world.spurious.places
@@ -363,14 +363,14 @@ def compare(
     ]
     # An error changes the size of all innovations; what names it goes first.
     checked.sort(
-        key=lambda each: (
-            not each.contradicts,
-            each.contradicts and each.statistic.family in GENERAL,
-            each.p,
-            -abs(each.distance),
+        key=lambda row: (
+            not row.contradicts,
+            row.contradicts and row.statistic.family in GENERAL,
+            row.p,
+            -abs(row.distance),
         )
     )
-    return tuple(each._replace(finding=finding(each.statistic, each.twins)) for each in checked)
+    return tuple(row._replace(finding=finding(row.statistic, row.twins)) for row in checked)
 
 
 def two_sided(
@@ -433,8 +433,8 @@ class _Meaning:
                 f"a noise or an error that depends on the {quantity}"
             )
         if family == "autocorrelation" and ", " in detail:
-            what = f"successive innovations of the {detail.split(', ')[0]} of a landmark are"
-            return f"{what} correlated: {beside}; errors that last: [filter] spacing"
+            pairs = f"successive innovations of the {detail.split(', ')[0]} of a landmark are"
+            return f"{pairs} correlated: {beside}; errors that last: [filter] spacing"
         if family == "correlation":
             component, _, quantity = detail.partition(" with ")
             cause = {

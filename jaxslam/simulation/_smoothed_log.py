@@ -101,18 +101,20 @@ def smooth(data: RecordedLog) -> SmoothedLog:
     by_odometry = is_single and sensor.of_points and sensor.free.mean.shape[0] > 0
     with float64():  # in single precision a long log does not converge
         if by_odometry and not associates(data.filter_options):
-            found, ending, step, count = _from_odometry(data)
+            smoothed, ending, step, count = _from_odometry(data)
         else:
-            found, ending, step, count = _from_filter(data)
+            smoothed, ending, step, count = _from_filter(data)
     is_near = ending == Ending.CONVERGED or step < _NEAR
-    if not (is_near and np.isfinite(found.noise).all() and np.isfinite(found.landmarks).all()):
+    if not (
+        is_near and np.isfinite(smoothed.noise).all() and np.isfinite(smoothed.landmarks).all()
+    ):
         raise InvalidField(
             "dataset",
             f"the smoothing of {data.name} did not converge in {count} steps: look at the path of "
             "jaxslam run, fit the noises (jaxslam fit FOLDER --write), or set a gate against wrong "
             "measurements",
         )
-    return found
+    return smoothed
 
 
 def _from_filter(data: RecordedLog) -> tuple[SmoothedLog, int, float, int]:
@@ -145,7 +147,7 @@ def _from_filter(data: RecordedLog) -> tuple[SmoothedLog, int, float, int]:
         slots, tags = slots[np.argsort(tags)], np.sort(tags)
     row = np.full(len(solved.joint.alive), -1)
     row[slots] = np.arange(len(slots))
-    found = SmoothedLog(
+    smoothed = SmoothedLog(
         noise=np.einsum("tij,tj->ti", roots, solved.noise),
         landmarks=np.asarray(solved.joint.landmarks)[slots],
         tag=tags,
@@ -153,7 +155,7 @@ def _from_filter(data: RecordedLog) -> tuple[SmoothedLog, int, float, int]:
         fused=bool((status == Status.FUSED).any()),
         still=not roots.any(),
     )
-    return found, int(solved.ending), float(solved.step), int(solved.iterations)
+    return smoothed, int(solved.ending), float(solved.step), int(solved.iterations)
 
 
 def _from_odometry(data: RecordedLog) -> tuple[SmoothedLog, int, float, int]:
@@ -175,11 +177,11 @@ def _from_odometry(data: RecordedLog) -> tuple[SmoothedLog, int, float, int]:
     before = np.concatenate([start[None], path[:-1]])
     roots = _noise_roots(data.motion, before, control)
     cov = np.asarray(data.pose_cov, np.float64)
-    given = start, cov, control, roots, z, slot, valid, path, points
+    arguments = start, cov, control, roots, z, slot, valid, path, points
     noise, landmarks, ending, decrement, count = jax.device_get(
-        _solve(data.motion, data.sensor, *given)
+        _solve(data.motion, data.sensor, *arguments)
     )
-    found = SmoothedLog(
+    smoothed = SmoothedLog(
         noise=np.einsum("tij,tj->ti", np.asarray(roots), noise),
         landmarks=landmarks,
         tag=tags,
@@ -187,7 +189,7 @@ def _from_odometry(data: RecordedLog) -> tuple[SmoothedLog, int, float, int]:
         fused=True,
         still=not np.asarray(roots).any(),
     )
-    return found, int(ending), float(np.sqrt(max(decrement, 0.0))), int(count)
+    return smoothed, int(ending), float(np.sqrt(max(decrement, 0.0))), int(count)
 
 
 @partial(jax.jit, inline=True)

@@ -218,8 +218,8 @@ def twin(dataset: RecordedLog, *, spurious: Spurious | None = None) -> Twin:
             )
         scan = dataset.log.scan
         valid, tag = np.asarray(scan.valid), np.asarray(scan.tag)
-        known = not associates(dataset.filter_options)
-        if known:
+        has_tags = not associates(dataset.filter_options)
+        if has_tags:
             _check_seen_twice(np.where(valid, tag, -1))
         smoothed = smooth(dataset)
         for missing, section in ((smoothed.still, "motion"), (not smoothed.fused, "sensor")):
@@ -231,7 +231,7 @@ def twin(dataset: RecordedLog, *, spurious: Spurious | None = None) -> Twin:
                 )
         count, seen = len(smoothed.landmarks), smoothed.seen
         names: tuple[int | str, ...] = tuple(range(count))
-        if known:  # what the gate rejected is of a landmark, too
+        if has_tags:  # what the gate rejected is of a landmark, too
             row_of_tag = np.full(max(int(tag.max()), int(smoothed.tag.max())) + 1, -1)
             row_of_tag[smoothed.tag] = np.arange(count)
             seen = np.where(valid & (tag >= 0), row_of_tag[np.maximum(tag, 0)], -1)
