@@ -78,13 +78,15 @@ def drawn(
     rng, points = np.random.default_rng(seed), posts()
     noise, goal = rng.normal(size=(steps, 2)) * [NOISES["v"], NOISES["omega"]], 0
     pose, path, controls = np.array([0.0, 0.0, 0.5]), [], []
+    planned = pose  # steering by the true pose would tell the odometry of its own noise
     begin = int(rng.uniform(0.1, 0.8) * steps)
     for k in range(steps):
-        way = GOALS[goal % len(GOALS)] - pose[:2]
+        way = GOALS[goal % len(GOALS)] - planned[:2]
         goal += int(np.hypot(*way) < 0.8)
-        omega = float(np.clip(wrap(np.arctan2(way[1], way[0]) - pose[2]), -0.7, 0.7))
+        omega = float(np.clip(wrap(np.arctan2(way[1], way[0]) - planned[2]), -0.7, 0.7))
         slips = slip if begin <= k < begin + steps // 10 else 0.0
         pose = moved(pose, (1 - slips) * 0.7 + noise[k, 0], omega + noise[k, 1], DT)
+        planned = moved(planned, 0.7, omega, DT)
         path.append(pose)
         controls.append([0.7, omega, DT])
     now = DT * np.arange(1, steps + 1)

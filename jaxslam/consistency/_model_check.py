@@ -16,7 +16,7 @@ import numpy as np
 import scipy  # its parts load where they are used
 from jax.sharding import NamedSharding
 from jax.typing import DTypeLike
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Float, PyTree
 
 from jaxslam.consistency._intervals import LEVEL
 from jaxslam.consistency._log_statistics import (
@@ -28,6 +28,7 @@ from jaxslam.consistency._log_statistics import (
 )
 from jaxslam.consistency._planted_faults import (
     Shape,
+    body_rates,
     faults_of,
     planted_logs,
     shapes_of,
@@ -38,8 +39,8 @@ from jaxslam.consistency.campaign._candidates import candidate_for, cast_floats,
 from jaxslam.consistency.campaign._work import Report
 from jaxslam.core._record import as_record
 from jaxslam.core._validation import log_of
-from jaxslam.core.logs._tables import INTERVAL, split_unit
-from jaxslam.core.protocols import Filter, Motion
+from jaxslam.core.logs._tables import split_unit
+from jaxslam.core.protocols import Filter
 from jaxslam.core.types import Info, Log, Scan, Truth
 from jaxslam.core.validation import (
     InvalidField,
@@ -61,11 +62,6 @@ LEAST = 20
 
 _PLANTED = 28
 """Logs with planted faults, which are one block if that is not larger than those of twins."""
-
-_SMOOTHED = 5
-"""Rows on either side over which the odometry is averaged: its noise would else correlate with the
-innovations that it causes."""
-
 
 Finding = Callable[[Statistic, Float[np.ndarray, "R"]], str]
 """(statistic, values of the twins) -> what it says"""
@@ -225,7 +221,8 @@ def check_models(
     innovations = np.where(fused[..., None], np.asarray(infos.innovation, np.float64), 0.0)
     covs = np.asarray(infos.innovation_cov, np.float64)[1]
     shapes = shapes_of(faults, slips, innovations[1:], np.where(fused[1, ..., None, None], covs, 0))
-    rates, time = _rates(world), np.asarray(world.time, np.float64)
+    speed, _, turn = body_rates(world).T
+    rates, time = Rates(speed, turn), np.asarray(world.time, np.float64)
 
     def statistics(info: Info, z: np.ndarray, valid: np.ndarray) -> list[Statistic]:
         return statistics_of(info, z, valid, world.sensor, rates, time, shapes)
@@ -308,32 +305,6 @@ def _widen(leaf: np.ndarray, spare: int) -> np.ndarray:
 def _run(infos: Info, i: int) -> Info:
     run: Info = jax.tree.map(lambda leaf: leaf[i], infos)
     return run
-
-
-@jax.jit
-def _moves(motion: Motion, controls: Float[Array, "T U"]) -> Float[Array, "T 3"]:
-    """The nominal motion of each row, in the robot's frame."""
-    origin, still = jnp.zeros(3, controls.dtype), jnp.zeros(len(motion.noises), controls.dtype)
-    return jax.vmap(lambda u: motion.step(origin, u, still)[:3])(controls)
-
-
-def _rates(world: Twin) -> Rates:
-    """Speed and turn rate of each row, means over some rows about it."""
-    controls = np.asarray(world.controls, jnp.result_type(float))
-    moves = np.asarray(jax.device_get(_moves(world.motion, controls)), np.float64)
-    names = world.motion.controls
-    time = np.asarray(world.time, np.float64)
-    interval = (
-        controls[:, names.index(INTERVAL)] if INTERVAL in names else np.diff(time, prepend=time[0])
-    )
-    total = np.cumsum(np.column_stack([moves[:, 0], moves[:, 2], interval]), axis=0)
-    total = np.concatenate([np.zeros((1, 3)), total])
-    rows = np.arange(len(moves))
-    high = np.minimum(rows + _SMOOTHED + 1, len(moves))
-    moved = total[high] - total[np.maximum(rows - _SMOOTHED, 0)]
-    lasts = moved[:, 2] > 0
-    rates = np.where(lasts[:, None], moved[:, :2] / np.where(lasts, moved[:, 2], 1.0)[:, None], 0.0)
-    return Rates(rates[:, 0], rates[:, 1])
 
 
 def compare(

@@ -18,10 +18,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from jaxslam.core.logs._tables import split_unit
+from jaxslam.core.logs._tables import INTERVAL, split_unit
+from jaxslam.core.protocols import Motion
 from jaxslam.core.types import Log, Scan, Truth
 from jaxslam.math import se2
-from jaxslam.math.angles import wrap
 from jaxslam.simulation._twin import Twin
 
 HALVES = 20
@@ -168,6 +168,52 @@ def faults_of(world: Twin) -> tuple[list[Fault], bool]:
     return [fault for fault in _FAULTS if possible[fault.name]], has_travel
 
 
+_SMOOTHED = 2
+"""Rows on either side over which the odometry is averaged: its noise would else correlate with the
+innovations that it causes, and so would what is planted in proportion to it."""
+
+
+def averaged_controls(
+    world: Twin,
+) -> tuple[Float[np.ndarray, "T U"], Float[np.ndarray, "T"]]:
+    """The controls of the log, means over some rows about each, and the interval of each row.
+
+    Not those of the smoothed path, which holds noises that were found in the same innovations.
+    """
+    controls, time = np.asarray(world.controls, np.float64), np.asarray(world.time, np.float64)
+    names = world.motion.controls
+    interval = np.diff(time, prepend=2 * time[0] - time[min(1, len(time) - 1)])
+    if INTERVAL in names:
+        interval = controls[:, names.index(INTERVAL)]
+    rates = np.array([(split_unit(name)[1] or "").endswith("/s") for name in names])
+    moved = np.where(rates, controls * interval[:, None], controls)
+    total = np.cumsum(np.column_stack([moved, interval]), axis=0)
+    total = np.concatenate([np.zeros((1, total.shape[1])), total])
+    rows = np.arange(len(controls))
+    high = np.minimum(rows + _SMOOTHED + 1, len(controls))
+    change = total[high] - total[np.maximum(rows - _SMOOTHED, 0)]
+    lasts = change[:, -1:] > 0
+    rate = np.where(lasts, change[:, :-1] / np.where(lasts, change[:, -1:], 1.0), 0.0)
+    kept = np.array([name == INTERVAL for name in names])
+    mean = np.where(rates, rate, rate * interval[:, None])
+    return np.where(kept, controls, mean), interval
+
+
+def body_rates(world: Twin) -> Float[np.ndarray, "T 3"]:
+    """Speed ahead and to the left [m/s], and turn rate [rad/s], in each row, by the odometry."""
+    controls, interval = averaged_controls(world)
+    moves = jax.device_get(_moves(world.motion, controls.astype(jnp.result_type(float))))
+    lasts = interval[:, None] > 0
+    return np.where(lasts, np.asarray(moves, np.float64) / np.where(lasts, interval[:, None], 1), 0)
+
+
+@jax.jit
+def _moves(motion: Motion, controls: Float[Array, "T U"]) -> Float[Array, "T 3"]:
+    """The nominal motion of each row, in the robot's frame."""
+    origin, still = jnp.zeros(3, controls.dtype), jnp.zeros(len(motion.noises), controls.dtype)
+    return jax.vmap(lambda u: motion.step(origin, u, still)[:3])(controls)
+
+
 def planted_logs(world: Twin, faults: Sequence[Fault], slips: bool) -> tuple[Truth, Log]:
     """The noise-free truth, and the logs (1 + F, …): without a fault, with each, with each slip."""
     dtype, steps = jnp.result_type(float), world.steps
@@ -178,7 +224,8 @@ def planted_logs(world: Twin, faults: Sequence[Fault], slips: bool) -> tuple[Tru
         none[fault.name][1 + i] = fault.amount
     for k in range(HALVES * slips):
         none["slip"][1 + len(faults) + k, _rows(steps, k, k + 1)] = _SLIP.amount
-    truth, logs = _plant(world, columns_of(world), Amounts(**none))
+    nominal = averaged_controls(world)[0].astype(dtype), body_rates(world).astype(dtype)
+    truth, logs = _plant(world, columns_of(world), nominal, Amounts(**none))
     return truth, logs
 
 
@@ -194,20 +241,24 @@ def _rows(steps: int, first: int, last: int) -> slice:
 
 
 @partial(jax.jit, static_argnames="columns")
-def _plant(world: Twin, columns: Columns, amounts: Amounts) -> tuple[Truth, Log]:
-    """The noise-free truth, and a log for each of a stack of amounts."""
+def _plant(
+    world: Twin, columns: Columns, nominal: tuple[Array, Array], amounts: Amounts
+) -> tuple[Truth, Log]:
+    """The noise-free truth, and a log for each of a stack of amounts.
+
+    nominal: (T, U) controls and (T, 3) rates of the robot, by the odometry alone.
+    """
     dtype = amounts.delay.dtype
     start = jnp.asarray(world.pose, dtype)
     path, logged = world.drive(start, jnp.zeros_like(jnp.asarray(world.noise, dtype)))
-    landmarks, time = jnp.asarray(world.landmarks, dtype), jnp.asarray(world.time, dtype)
+    landmarks, (controls, twist) = jnp.asarray(world.landmarks, dtype), nominal
     seen = jnp.asarray(world.seen, jnp.int32)
     travel, turn, distance, ranges, bearing = (jnp.asarray(part, dtype) for part in columns[:5])
-    heading = jnp.unwrap(path[:, 2])
 
     def log_with(amount: Amounts) -> Log:
-        at = time - amount.delay
-        x, y, theta = (jnp.interp(at, time, part) for part in (path[:, 0], path[:, 1], heading))
-        poses = path.at[:, :3].set(jnp.stack([x, y, wrap(theta)], axis=1))
+        # Where the robot was when it measured.
+        back = jax.vmap(se2.compose)(path[:, :3], -amount.delay * twist)
+        poses = path.at[:, :3].set(back)
 
         def measure(pose: Array, row: Array) -> Array:
             z = world.sensor.observe(pose, landmarks[jnp.maximum(row, 0)])
@@ -225,10 +276,9 @@ def _plant(world: Twin, columns: Columns, amounts: Amounts) -> tuple[Truth, Log]
         scan = Scan(jnp.where((seen >= 0)[..., None], z, 0.0), seen, seen >= 0)
         # The first column of travel and of turn; a left increment has no part in the bending.
         first_travel, first_turn = (part * (jnp.cumsum(part) == 1) for part in (travel, turn))
-        moved = logged @ first_travel
         scales = amount.slip[:, None] * travel[None] + amount.turning * turn[None]
-        controls = logged * (1 + scales) + amount.bending * moved[:, None] * first_turn[None]
-        return Log(controls, scan)
+        bent = amount.bending * (controls @ first_travel)[:, None] * first_turn[None]
+        return Log(logged + controls * scales + bent, scan)
 
     truth = Truth(path, landmarks, jnp.zeros(len(path), jnp.int32), start)
     if world.associates or world.spurious is not None:
