@@ -114,7 +114,7 @@ def shares(scores: list[RecordingScores], factor: float, lag: float) -> dict[str
 
 
 def measure(quick: bool = False) -> list[Metric]:
-    count = 40 if quick else 200
+    count = 40 if quick else 600
     drawn = recordings(world(), count)
     sets = {
         "honest": (judged(drawn), 1.0, 0.0),

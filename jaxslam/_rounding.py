@@ -82,7 +82,7 @@ class Rounding(NamedTuple):
 
     @property
     def remedy(self) -> str:
-        """What to do about it."""
+        """Advice against the rounding."""
         advice = "set jax_enable_x64" if self.dtype == np.float32 else "begin with less variance"
         if self.square_root:
             return advice
@@ -131,7 +131,7 @@ def rounding_of(
 
 
 class _HostTrace(NamedTuple):
-    """What is compared of a run, on the host."""
+    """The numbers of a run that are compared, on the host."""
 
     pose: Float[np.ndarray, "T 3"]
     pose_cov: Float[np.ndarray, "T 3 3"]
@@ -198,7 +198,7 @@ def _on_host(trace: Trace) -> _HostTrace:
 
 
 def _difference(single: _HostTrace, double: _HostTrace) -> str:
-    """How a run in float32 differs from that in float64, with numbers; "" within rounding."""
+    """The difference of a run in float32 from that in float64, in words; "" within rounding."""
     both = single, double
     fused = [run.status == Status.FUSED for run in both]
     used = [int(mask.sum()) for mask in fused]

@@ -192,7 +192,7 @@ def film_files(films: Mapping[str, "Film"], *, suffixed: bool) -> Files:
     """
     from jaxslam.results.plot._film import mp4_problem  # matplotlib is slow to load
 
-    notes = dict.fromkeys(film.scene.note for film in films.values() if film.scene.note)
+    notes = dict.fromkeys(film.note for film in films.values() if film.note)
     problem = mp4_problem()
     kind = "gif" if problem else "mp4"
     if problem:

@@ -4,6 +4,7 @@ covariances that a recorded robot published."""
 import argparse
 import re
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -17,6 +18,7 @@ from jaxslam.consistency._verdict import is_faulty
 from jaxslam.consistency.campaign._judging import judge_sources
 from jaxslam.consistency.campaign._pieces import cores
 from jaxslam.consistency.campaign._run_estimates import RunFault
+from jaxslam.core._names import closest_name
 from jaxslam.core.validation import at_least, or_none, positive, require
 from jaxslam.datasets._judged_folders import DrawsFolder, folder_source, read_draws, run_name
 from jaxslam.results import _campaign_files as campaign_files
@@ -24,6 +26,20 @@ from jaxslam.results._campaign_files import FORMATS
 
 FOLDER = "estimates"
 """Default folder of the estimates that the command computes."""
+
+_OF_ESTIMATES: dict[str, tuple[str, object]] = {
+    "ESTIMATES": ("estimates", []),
+    "--draws": ("draws", None),
+    "--estimator": ("estimator", None),
+    "--time-limit": ("time_limit", None),
+    "--processes": ("processes", None),
+    "--filters": ("filters", ""),
+    "--every": ("stride", 1),
+    "--compare": ("compare", None),
+    "--runs": ("runs", None),
+    "--bound": ("bound", False),
+}
+"""Field and default of each option that a recording does not have."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -72,6 +88,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="judge each K-th step alone, where an estimator writes fewer rows; of filters, too "
         "(default: 1)",
     )
+    parser.add_argument(
+        "--compare",
+        metavar="NAME",
+        help="also compare every other column with this one, of ESTIMATES or --filters, run by run "
+        "on the same draws: differences with intervals, in the table and on the page",
+    )
     parser.add_argument("--runs", type=int, help="judge the first runs alone (default: all)")
     parser.add_argument(
         "--bound",
@@ -94,13 +116,13 @@ def run_judge(options: argparse.Namespace, command: str) -> int:
     It is 1 where an estimator or a filter is faulty, as not finite (`is_faulty`), or a figure
     cannot be drawn; a verdict does not change it.
     """
-    if options.estimate is None and options.truth is None:
-        return _judge_estimates(options, command)
-    for name in ("estimates", "draws", "estimator"):
-        if getattr(options, name):
-            label = name.upper() if name == "estimates" else f"--{name}"
-            raise ValueError(f"{label}: expected none beside --estimate and --truth")
-    return judge_recording.run(options, command)
+    is_recording = options.estimate is not None or options.truth is not None
+    others = _OF_ESTIMATES if is_recording else judge_recording.OPTIONS
+    for label, (field, default) in others.items():
+        if getattr(options, field) != default:
+            beside = "beside" if is_recording else "without"
+            raise ValueError(f"{label}: expected none {beside} --estimate and --truth")
+    return (judge_recording.run if is_recording else _judge_estimates)(options, command)
 
 
 def _judge_estimates(options: argparse.Namespace, command: str) -> int:
@@ -113,7 +135,7 @@ def _judge_estimates(options: argparse.Namespace, command: str) -> int:
         raise ValueError("ESTIMATES: expected a folder of estimates, got none")
     if options.draws is None:
         raise ValueError("--draws: expected the folder of `jaxslam draws`, got none")
-    folders = _named([Path(folder) for folder in options.estimates])
+    folders = _name_folders([Path(folder) for folder in options.estimates])
     draws = read_draws(Path(options.draws))
     runs = draws.runs if options.runs is None else options.runs
     for name, count in (
@@ -136,6 +158,16 @@ def _judge_estimates(options: argparse.Namespace, command: str) -> int:
         raise ValueError(
             f"ESTIMATES: {twice[0]} is the name of a filter: expected a folder of another name"
         )
+    if options.compare is not None:
+        names = [*folders, *filters]
+        if options.compare not in names:
+            raise ValueError(
+                f"--compare: expected one of ESTIMATES and --filters, {', '.join(names)}, got "
+                f"{options.compare!r}{closest_name(options.compare, names)}"
+            )
+        for counted, count in (("columns", len(names)), ("runs", runs)):
+            if count < 2:
+                raise ValueError(f"--compare: expected two {counted} or more, got {count}")
     devices = chosen_devices(options.devices)
     check_out(options.out, "judge")
     failures: dict[int, RunFault] = {}
@@ -143,7 +175,7 @@ def _judge_estimates(options: argparse.Namespace, command: str) -> int:
         if len(folders) > 1:
             raise ValueError(f"--estimator: expected one folder of estimates, got {len(folders)}")
         (folder,) = folders.values()
-        program = Programs(options.estimator, draws.path, folder, options.time_limit)
+        program = Programs(options.estimator, draws, folder, options.time_limit)
         failures = program.run(range(runs), options.processes or cores())
     for folder in folders.values():
         _check_folder(folder, draws, bool(failures))
@@ -163,6 +195,7 @@ def _judge_estimates(options: argparse.Namespace, command: str) -> int:
             bound=options.bound,
             devices=devices,
         )
+    campaign = replace(campaign, reference=options.compare or "")
     print(campaign)
     failed: list[str] = []
     paths = campaign_files.save_campaign(
@@ -175,7 +208,7 @@ def _judge_estimates(options: argparse.Namespace, command: str) -> int:
     return FAILED if is_wrong or failed else 0
 
 
-def _named(folders: list[Path]) -> dict[str, Path]:
+def _name_folders(folders: list[Path]) -> dict[str, Path]:
     """Folders by their names, which name the columns of the table."""
     named: dict[str, Path] = {}
     for folder in folders:

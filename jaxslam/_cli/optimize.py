@@ -486,8 +486,7 @@ def _film(plan: OptimizePlan, optimum: Optimum) -> Files:
     Iterate k is the result of the same optimization with a limit of k steps; the limit is an
     argument of the compiled program.
     """
-    from jaxslam.results import plot  # matplotlib is slow to load
-    from jaxslam.results.plot._graph_figures import graph_scene
+    from jaxslam.results.plot._graph_figures import graph_film  # matplotlib is slow to load
 
     factors, kernels = optimum.problem.factors, optimum.problem.kernels
     total = int(optimum.solution.iterations)
@@ -501,7 +500,7 @@ def _film(plan: OptimizePlan, optimum: Optimum) -> Files:
             iterates.append(jax.tree.map(np.asarray, iterate.graph))
             costs.append(float(iterate.chi2))
             progress(frame + 1, len(steps))
-    scene = graph_scene(
+    film = graph_film(
         iterates,
         costs,
         steps=[0, *steps],
@@ -509,7 +508,7 @@ def _film(plan: OptimizePlan, optimum: Optimum) -> Files:
         title=Path(plan.path).name,
         note="" if len(steps) == total else f"{len(steps)} of {total} iterations shown",
     )
-    return film_files({"optimize": plot.Film(scene, fps=2.0)}, suffixed=False)
+    return film_files({"optimize": film}, suffixed=False)
 
 
 def as_text(value: object) -> str:

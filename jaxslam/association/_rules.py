@@ -43,7 +43,7 @@ def check_new_gate(gate: Number | None, new_gate: Number | None) -> None:
 
 
 def within_gate(pairs: Pairs, gate: Number | None) -> Bool[Array, "M N"]:
-    """Which possible pairs are within the gate; without one, those of finite d²."""
+    """Mask of the possible pairs within the gate; without one, of finite d²."""
     gamma = gate_quantile(gate, pairs.innovation.shape[2])
     near = is_inside(pairs.distance, gamma)
     return pairs.possible & near

@@ -286,6 +286,7 @@ def fit_noise(
                     return trial
         return None
 
+    # Fisher scoring, by the expected information.
     for _ in range(iterations):
         step, gain = _newton_step(point.expected, point, logged)
         with refusals_of("fit_noise"):
@@ -296,6 +297,8 @@ def fit_noise(
         path.append(point.q)
         if gain <= tolerance:
             break
+
+    # Newton's steps, by the observed information, which takes 2 P runs.
     observed = _observed_information(evaluate, point, logged)
     for _ in range(_POLISH):
         step, gain = _newton_step(observed, point, logged)
@@ -308,6 +311,8 @@ def fit_noise(
         point = higher
         path.append(point.q)
         observed = _observed_information(evaluate, point, logged)
+
+    # Standard errors.
     without = _directions_without_information(point)
 
     def may_be_none(i: int) -> bool:

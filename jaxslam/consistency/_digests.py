@@ -155,6 +155,8 @@ def _of_user(function: FunctionType) -> bool:
 
 
 def _name(value: object) -> str:
+    if isinstance(value, np.ufunc):  # before NumPy 2.2 without __qualname__ and __module__
+        return f"numpy.{value.__name__}"
     of = value if hasattr(value, "__qualname__") else type(value)
     return f"{of.__module__}.{of.__qualname__}"
 

@@ -98,10 +98,10 @@ def _files(world: World, odometry: Odometry) -> str:
 
 def _times(world: World, odometry: Odometry) -> str:
     count = world.motion.count if isinstance(world.motion, Substeps) else 1
-    lines = "line" if count == 1 else f"{count}th line"
+    lines = "every line" if count == 1 else f"one in {count} lines"
     first = "" if odometry.rows[0] == odometry.time[0] else " after the first"
     scans = (
-        f"There is a scan at every {lines} of `odometry.csv`{first}, at t = "
+        f"There is a scan at {lines} of `odometry.csv`{first}, at t = "
         f"{', '.join(f'{t:g}' for t in odometry.rows[:3])}, …, {odometry.rows[-1]:g} s. The lines "
         "of `measurements.csv` with its time are its measurements, taken at the pose of that time, "
         "after the motion that leads to it; without lines the scan is empty."

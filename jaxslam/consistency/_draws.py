@@ -103,12 +103,16 @@ def write_draws(
         check_tables(world)
     odometry = odometry_of(world, world.controls)
     folder = Path(folder)
-    campaign = _identity(world, key)
+    parts = identity(world, {}, key, jax.default_backend())
+    # What agrees between two calls for one folder.
+    campaign = {name: text for name, text in parts.items() if name not in _NOT_OF_DRAWS}
+    campaign |= {"filter options": digest(world.filter_options)}
     checksums = _earlier_checksums(folder, campaign, runs)
     record = _record(world, key, runs, campaign, options)
 
     def write_record() -> None:
-        _write(folder / RECORD, _json(record | {"checksums": dict(sorted(checksums.items()))}))
+        content = record | {"checksums": dict(sorted(checksums.items()))}
+        _write(folder / RECORD, json.dumps(content, indent=2, ensure_ascii=False) + "\n")
 
     folder.mkdir(parents=True, exist_ok=True)
     for stale in folder.glob(f"{_UNFINISHED}*"):
@@ -151,13 +155,6 @@ def _histories(
             block = draw_block(world, key, first)
         place = number - first
         yield number, jax.tree.map(lambda leaf, i=place: leaf[i], block)
-
-
-def _identity(world: World, key: jax.Array) -> dict[str, str]:
-    """What agrees between two runs of one folder."""
-    parts = identity(world, {}, key, jax.default_backend())
-    kept = {name: text for name, text in parts.items() if name not in _NOT_OF_DRAWS}
-    return kept | {"filter options": digest(world.filter_options)}
 
 
 def _record(
@@ -256,10 +253,6 @@ def _write(path: Path, text: str) -> None:
     finally:
         with contextlib.suppress(OSError):
             hidden.unlink()
-
-
-def _json(content: Mapping[str, object]) -> str:
-    return json.dumps(content, indent=2, ensure_ascii=False) + "\n"
 
 
 def _sha256(content: bytes) -> str:

@@ -18,6 +18,7 @@ from jaxslam.consistency._intervals import LEVEL, Average, percentage
 from jaxslam.consistency._measures.nees import DOF
 from jaxslam.consistency._verdict import TOLERANCE
 from jaxslam.consistency.metrics._paths import alignment
+from jaxslam.core._units import are_headings_in_degrees
 from jaxslam.core.logs._streams import geodesic_poses, known_poses
 from jaxslam.core.validation import (
     InvalidField,
@@ -28,7 +29,7 @@ from jaxslam.core.validation import (
     refusals_of,
     require,
 )
-from jaxslam.math._definite import asymmetric, invertible
+from jaxslam.math._definite import is_asymmetric, is_invertible
 from jaxslam.math.numpy_poses import compose, inverse, wrapped
 from jaxslam.math.stats import chi2_quantile, normal_quantile, t_quantile
 
@@ -50,6 +51,10 @@ _AXES = {"pose": slice(0, 3), "position": slice(0, 2), "heading": slice(2, 3)}
 _FAULTY = 0.05
 """Share of the poses without a valid covariance beyond which the others do not decide, as of the
 runs of a campaign."""
+
+_SHARE_OF_FRAMES = 0.1
+"""Share of the position errors that the best rigid motion leaves, below which the estimate and the
+truth may be in two frames."""
 
 _HALF = 0.1
 """Half of the time over which the velocity of the truth is taken [s], at least: the noise of a
@@ -246,8 +251,9 @@ def judge_recording(
         longest_gap: the longest interval of the truth that is interpolated [s]; default ten times
             its median.
     Raises:
-        ValueError: on other shapes, times that do not rise, poses that are not finite, fewer than
-            two times of the estimate at which the truth is known.
+        ValueError: on other shapes, times that do not rise, poses that are not finite, headings
+            that fit the positions in degrees, fewer than two times of the estimate at which the
+            truth is known.
     """
     with refusals_of("judge_recording"):
         require("align", align, one_of(*ALIGNMENTS))
@@ -306,6 +312,8 @@ def judge_recording(
         sigma[ok, _AXES[name]] = np.sqrt(variance[ok, _AXES[name]])
     compared = error[is_compared]
     doubts = list(aligned.notes)
+    if align == "none":
+        doubts += _frames_note(pose[is_compared], true[is_compared])
     if cov is None:
         doubts.append("the estimate has no covariance: its errors alone are measured")
     elif not blocks:
@@ -346,7 +354,26 @@ def _stamped_poses(
         raise ValueError(
             f"expected times that rise, got {after} in row {back[0] + 1} after {before}"
         )
+    if are_headings_in_degrees(pose):
+        raise ValueError("expected headings in radians, got some that fit the positions in degrees")
     return time, pose
+
+
+def _frames_note(pose: Float[np.ndarray, "n 3"], truth: Float[np.ndarray, "n 3"]) -> list[str]:
+    """A sentence where nearly all of the position errors are one rigid motion, as of two frames."""
+    if not np.ptp(truth[:, :2], axis=0).any():  # positions show no turn
+        return []
+    carried = compose(alignment(truth[:, :2], pose[:, :2]), truth)
+    before, after = (
+        float(np.sqrt(((path[:, :2] - pose[:, :2]) ** 2).sum(axis=1).mean()))
+        for path in (truth, carried)
+    )
+    if not after < _SHARE_OF_FRAMES * before:
+        return []
+    return [
+        f"one rigid motion of the truth reduces its distance from the estimate from {before:.3g} m "
+        f"to {after:.3g} m (RMS): if the two are in different frames, align best"
+    ]
 
 
 class _Rows(NamedTuple):
@@ -418,7 +445,7 @@ class _Claims(NamedTuple):
         if cov is None:
             return cls(unit, {name: np.zeros(count, bool) for name in DOF}, {}, turn)
         is_unknown = cov[:, 0, 0] == -1
-        by_part: dict[str, dict[str, np.ndarray]] = {}
+        faults_by_block: dict[str, dict[str, np.ndarray]] = {}
         valid = {}
         for name, axes in _AXES.items():
             block = cov[:, axes, axes]
@@ -430,26 +457,27 @@ class _Claims(NamedTuple):
                 "not finite": ~finite,
                 "zero": (safe == 0).all(axis=(1, 2)),
                 f"above {LARGEST:g}": (variance > LARGEST).any(axis=1),
-                "not symmetric": asymmetric(safe, 1e-6),  # of float32
-                "singular, or not positive definite": ~invertible(safe),
+                "not symmetric": is_asymmetric(safe, 1e-6),  # of float32
+                "singular, or not positive definite": ~is_invertible(safe),
             }
-            faulty = np.zeros(count, bool)
-            by_part[name] = {}
-            for reason, fails in tests.items():  # the first reason that holds
-                by_part[name][reason] = fails & ~faulty
-                faulty = faulty | fails
-            others = block[~faulty]
-            constant = ~faulty & (len(others) > 1 and bool((others == others[:1]).all()))
-            by_part[name]["constant from beginning to end"] = constant
-            valid[name] = ~faulty & ~constant
+            # A pose has one fault: of several the first.
+            sound = np.ones(count, bool)
+            faults_by_block[name] = {}
+            for fault, fails in tests.items():
+                faults_by_block[name][fault] = sound & fails
+                sound = sound & ~fails
+            rest = block[sound]
+            is_constant = len(rest) > 1 and bool((rest == rest[:1]).all())
+            faults_by_block[name]["constant from beginning to end"] = sound & is_constant
+            valid[name] = sound & (not is_constant)
         valid["pose"] &= valid["position"] & valid["heading"]
         faults = {}
-        for reason, position in by_part["position"].items():
-            heading = by_part["heading"][reason]
+        for fault, position in faults_by_block["position"].items():
+            heading = faults_by_block["heading"][fault]
             both = position & heading
-            faults[f"covariance {reason}"] = both
-            faults[f"covariance of the position {reason}"] = position & ~both
-            faults[f"variance of the heading {reason}"] = heading & ~both
+            faults[f"covariance {fault}"] = both
+            faults[f"covariance of the position {fault}"] = position & ~both
+            faults[f"variance of the heading {fault}"] = heading & ~both
         apart = valid["position"] & valid["heading"] & ~valid["pose"]
         faults["covariance of position and heading singular together"] = apart
         usable = valid["position"] | valid["heading"]
@@ -603,14 +631,10 @@ def _products(
     return np.asarray(lags[: len(u)])
 
 
-def _first_without(products: Float[np.ndarray, "n d d"]) -> int:
-    """The first lag with a trace of zero or less: how long errors are correlated, in poses."""
-    ends = np.trace(products, axis1=1, axis2=2) <= 0
-    return int(np.argmax(ends)) if ends.any() else len(products)
-
-
 def _correlation_length(z: Float[np.ndarray, "n d"]) -> int:
-    return _first_without(_products(z, z))
+    """The number of poses over which errors are correlated: the first lag with tr Σ z zᵀ <= 0."""
+    ends = np.trace(_products(z, z), axis1=1, axis2=2) <= 0
+    return int(np.argmax(ends)) if ends.any() else len(z)
 
 
 def _long_run(

@@ -196,8 +196,10 @@ def run_statistics(
     )
     sums, (nees, regular) = jax.lax.scan(step, nothing, (estimate, info, held))
     product, left, right, pairs = (pair.sum(axis=1) for pair in sums.pairs)
+    # √(Σ|w|² Σ|w'|²) by lag, over which Σ wᵀw' is the correlation; 0 without a pair.
     both = left * right
     length = jnp.where(both > 0, jnp.sqrt(jnp.where(both > 0, both, 1.0)), 0.0)
+    # The map at the end.
     named = (held[-1] >= 0) & (estimate.point_covs[-1] != 0).any()  # a known map has no errors
     off = points[jnp.maximum(held[-1], 0)] - estimate.points[-1]
     square = jnp.where(named, (off**2).sum(axis=-1), 0.0).sum()

@@ -163,7 +163,7 @@ def is_faulty(counts: Mapping[str, int]) -> bool:
 
 
 class _Measured(NamedTuple):
-    """What became of the measurements of the finite runs."""
+    """The fate of the measurements of the finite runs, in numbers."""
 
     total: int
     """measurements in the logs"""

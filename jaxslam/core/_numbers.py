@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 from numpy.typing import ArrayLike
 
-from jaxslam.math._arrays import Number, held_array, is_concrete
+from jaxslam.math._arrays import Number, as_array, is_concrete
 from jaxslam.math.stats import chi2_quantile
 
-__all__ = ["gate_quantile", "held_array", "is_concrete", "is_number", "is_whole", "largest"]
+__all__ = ["as_array", "gate_quantile", "is_concrete", "is_number", "is_whole", "largest"]
 
 
 def is_number(value: object) -> bool:

@@ -46,7 +46,7 @@ def _is_number(value: PyTree) -> bool:
 
 
 def describe(value: object) -> str:
-    """What was got, in a few words: a number or text as it is, the shape of an array, a kind."""
+    """A value in few words: a number or text as it is, the shape of an array, a kind."""
     if value is None or isinstance(value, str | int | float | complex):
         return repr(value)
     if isinstance(value, type):

@@ -433,7 +433,7 @@ class Linearizer(Component):
             {
                 "motion": "motion, u, point",
                 "observe": "sensor, point",
-                "invert": "s, z, tag, point",
+                "invert": "sensor, z, tag, point",
             },
         )
 

@@ -379,7 +379,7 @@ class Beams(NamedTuple):
     def returns(
         self, max_range: float | JaxOrNumPy = np.inf, *, min_range: float | JaxOrNumPy = 0.0
     ) -> tuple[Bool[JaxOrNumPy, "*n"], Bool[JaxOrNumPy, "*n"]]:
-        """Which beams met an obstacle nearer than max_range [m], and which met none up to there.
+        """Masks of the beams with an obstacle nearer than max_range [m], and of those without one.
 
         The others have no information, nor has a range of min_range or less. See the table of
         `Beams`.

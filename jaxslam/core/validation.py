@@ -24,8 +24,8 @@ import numpy as np
 from jaxslam._public import publish
 from jaxslam.core._reprs import describe, real_array, shape_text, with_article
 from jaxslam.core._units import TURN
-from jaxslam.math._arrays import held_array, is_concrete
-from jaxslam.math._definite import asymmetric, indefinite
+from jaxslam.math._arrays import as_array, is_concrete
+from jaxslam.math._definite import is_asymmetric, is_indefinite
 
 __all__ = [
     "Check",
@@ -40,6 +40,7 @@ __all__ = [
     "is_concrete",
     "mounting_pose",
     "names",
+    "not_negative",
     "one_of",
     "or_none",
     "positive",
@@ -200,6 +201,12 @@ def positive(value: Any) -> Any:
     return in_range(0.0, math.inf, open=True)(value)
 
 
+def not_negative(value: Any) -> Any:
+    """The check of a finite number >= 0."""
+    finite(least=0.0)(value)
+    return value
+
+
 def in_range(low: float, high: float, *, open: bool = False) -> Check:
     """The check of a number from low to high; open: without the ends."""
     expected = f"a number from {low:g} to {high:g}"
@@ -286,7 +293,7 @@ def finite(*shape: int, least: float = -math.inf) -> Check:
             numbers = np.asarray(array)
             if not np.all(np.isfinite(numbers) & (numbers >= least)):
                 raise ValueError(f"expected {expected}, got {' '.join(str(numbers).split())}")
-        return held_array(value)
+        return as_array(value)
 
     return check
 
@@ -302,21 +309,21 @@ def covariance(size: int) -> Check:
         if (array := real_array(value)) is None:
             raise ValueError(f"expected real numbers, got dtype {np.asarray(value).dtype}")
         if not is_concrete(array):
-            return held_array(value)
+            return as_array(value)
         matrix = np.asarray(array)
         if not np.issubdtype(matrix.dtype, np.floating):
             matrix = matrix.astype(np.float64)
         if not np.all(np.isfinite(matrix)):
             raise ValueError("the covariance has a NaN or an infinity")
         # 1e-6: numbers are often written with six digits.
-        if asymmetric(matrix, 1e-6):
+        if is_asymmetric(matrix, 1e-6):
             raise ValueError("the covariance is not symmetric")
-        if indefinite(matrix, 1e-6):
+        if is_indefinite(matrix, 1e-6):
             variance = np.diagonal(matrix).min()
             eigenvalue = np.linalg.eigvalsh(matrix.astype(np.float64))[0]
             cause = "negative variance" if variance < 0 else f"eigenvalue {eigenvalue:.3g}"
             raise ValueError(f"the covariance is not positive semi-definite ({cause})")
-        return held_array(value)
+        return as_array(value)
 
     return check
 
@@ -340,7 +347,7 @@ def mounting_pose(value: Any) -> Any:
                 # through `require`, `check_field`, two __post_init__ and __init__ to the user
                 stacklevel=7,
             )
-    return held_array(value)
+    return as_array(value)
 
 
 def prng_key(value: Any) -> Any:

@@ -18,7 +18,7 @@ from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate
 from jaxslam.datasets._dataset import Dataset
 from jaxslam.filters._ekf.map_coordinates import cov_of_coordinates
-from jaxslam.math._definite import invertible
+from jaxslam.math._definite import is_invertible
 from jaxslam.math.stats import chi2_band, chi2_quantile
 
 _in_coordinates = jax.jit(cov_of_coordinates, static_argnames="square_root", inline=True)
@@ -242,7 +242,7 @@ def _map_errors(
     gap = (survey[tag] - points)[:, :, None]
     covs = np.asarray(last.point_covs)[named]
     finite = np.isfinite(covs).all(axis=(1, 2)) & np.isfinite(points).all(axis=1)
-    regular = finite & invertible(np.where(finite[:, None, None], covs, 0))
+    regular = finite & is_invertible(np.where(finite[:, None, None], covs, 0))
     map_test = None
     if regular.all():
         slots = np.flatnonzero(named)

@@ -5,6 +5,7 @@ draws/truth/0000/truth.csv, landmarks.csv              what run 0 is compared wi
 estimates/0000/trajectory.csv, map.csv, innovations.csv     as `jaxslam run` writes them
 """
 
+import hashlib
 import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -40,7 +41,8 @@ TRAJECTORY, MAP, INNOVATIONS = "trajectory.csv", "map.csv", "innovations.csv"
 """The files of the estimate of a run; the last two are optional."""
 
 PROGRAM = "judge.json"
-"""The file, in the folder of an estimate, with the command that wrote it and its wall time."""
+"""The file, in the folder of an estimate, with the command that wrote it, the checksums of what it
+read, and its wall time."""
 
 _SAME_TIME = 0.5e-6
 """Largest difference of two times that are one [s]: half of the last digit of stamps in µs."""
@@ -68,6 +70,14 @@ class DrawsFolder(NamedTuple):
     """the option; None for the scenario's own"""
     key: jax.Array
     runs: int
+    checksums: Mapping[str, str]
+    """SHA-256 of each file, as it was written; empty where nobody noted it"""
+
+    def log_checksum(self, name: str) -> str:
+        """The checksum of the files of a run that an estimator reads."""
+        of_run = f"{RUNS}/{name}/"
+        lines = [f"{k} {v}" for k, v in sorted(self.checksums.items()) if k.startswith(of_run)]
+        return hashlib.sha256("\n".join(lines).encode()).hexdigest()
 
 
 def read_draws(folder: Path) -> DrawsFolder:
@@ -83,9 +93,12 @@ def read_draws(folder: Path) -> DrawsFolder:
             raise ValueError
         if not (steps is None or type(steps) is int):
             raise ValueError
+        checksums = content.get("checksums", {})
+        if not all(isinstance(text, str) for text in checksums.values()):
+            raise ValueError
     except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
         raise InvalidFile(path, "expected the settings that `jaxslam draws` writes") from error
-    return DrawsFolder(folder, scenario, steps, key, runs)
+    return DrawsFolder(folder, scenario, steps, key, runs, checksums)
 
 
 def _key(kind: str, numbers: Sequence[int]) -> jax.Array:
@@ -150,18 +163,22 @@ def folder_source(
         gap[:, 2] = np.minimum(gap[:, 2], np.abs(2 * math.pi - gap[:, 2]))
         if not (largest := float(gap.max())) <= _SAME:
             path = draws.path / TRUTH / name / "truth.csv"
-            raise _other_draws(path, draws, f"poses that differ by {largest:.3g}")
+            raise _draws_error(path, draws, f"poses that differ by {largest:.3g}")
         if number == 0:  # the other runs have the same key
             _check_log(draws, name, measurements, log)
         truth = truth._replace(pose=in_file.pose)
         if number in failures:
             return Outcome(truth, None, failures[number])
         folder = estimates / name
+        origin = origin_of(folder)
+        if origin.get("log", checksum := draws.log_checksum(name)) != checksum:
+            reason = f"expected an estimate of {draws.path}, got one of other draws"
+            raise InvalidFile(folder / PROGRAM, reason)
         size = int(np.shape(log.scan.z)[2])
         result = read_estimate(folder, in_file, stride, size)
         if isinstance(result, RunFault):
             return Outcome(truth, None, result)
-        return Outcome(truth, result, None, _seconds(folder / PROGRAM))
+        return Outcome(truth, result, None, _seconds(origin))
 
     return outcome_of
 
@@ -175,14 +192,14 @@ def _check_log(draws: DrawsFolder, name: str, measurements: Sequence[str], log: 
     in_file = CsvTable(path).table(measurements, "of measurements").values(measurements)
     drawn = np.asarray(log.scan.z, np.float64)[valid]
     if in_file.shape != drawn.shape:
-        raise _other_draws(path, draws, f"{len(in_file)} lines, where {len(drawn)} are drawn")
+        raise _draws_error(path, draws, f"{len(in_file)} lines, where {len(drawn)} are drawn")
     # Lines of one time are in any order.
     largest = float(np.abs(np.sort(in_file, axis=0) - np.sort(drawn, axis=0)).max())
     if not largest <= _SAME:
-        raise _other_draws(path, draws, f"numbers that differ by {largest:.3g}")
+        raise _draws_error(path, draws, f"numbers that differ by {largest:.3g}")
 
 
-def _other_draws(path: Path, draws: DrawsFolder, got: str) -> InvalidFile:
+def _draws_error(path: Path, draws: DrawsFolder, got: str) -> InvalidFile:
     """The error about a file that is not what the scenario draws."""
     return InvalidFile(
         path,
@@ -191,12 +208,19 @@ def _other_draws(path: Path, draws: DrawsFolder, got: str) -> InvalidFile:
     )
 
 
-def _seconds(path: Path) -> float | None:
-    """The wall time of the program that wrote an estimate [s]; None where nobody noted it."""
+def origin_of(folder: Path) -> dict[str, object]:
+    """What the folder of an estimate notes about its origin; empty where nothing is noted."""
     try:
-        return float(json.loads(path.read_text(encoding="utf-8"))["seconds"])
-    except (OSError, ValueError, LookupError, TypeError):
-        return None
+        note = json.loads((folder / PROGRAM).read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return note if isinstance(note, dict) else {}
+
+
+def _seconds(origin: Mapping[str, object]) -> float | None:
+    """The wall time of the program that wrote an estimate [s]; None where nobody noted it."""
+    seconds = origin.get("seconds")
+    return seconds if isinstance(seconds, float) and math.isfinite(seconds) else None
 
 
 def read_estimate(
@@ -211,6 +235,8 @@ def read_estimate(
         return RunFault(MISSING, detail)
     steps = len(truth.pose)
     path = _Table(folder / TRAJECTORY)
+    if not path.header:
+        return RunFault(EARLY, f"{TRAJECTORY} is empty")
     at = path.steps(truth)
     if isinstance(at, RunFault):
         return at
@@ -300,8 +326,8 @@ class _Table:
     def __init__(self, path: Path) -> None:
         self.path, data = read_bytes(path)
         lines = [line for line in data.decode("utf-8-sig", "replace").splitlines() if line.strip()]
-        if len(lines) == 1:  # a header alone: a program that ended at once, or nothing to tell
-            self.header = [cell.strip() for cell in lines[0].split(",")]
+        if len(lines) < 2:  # a header, or nothing: a program that ended at once, or nothing to tell
+            self.header = [cell.strip() for cell in lines[0].split(",")] if lines else []
             self.lines: list[int] = []
             self.cells: list[list[str]] = []
         else:

@@ -97,7 +97,8 @@ def recorded_path(source: str | Path) -> RecordedPath:
         ValueError: with the file, and its line or topic: on a source that cannot be read, a topic
             or a frame that is not there, without messages or of another type, poses in several
             frames, stamps of which more than a tenth go back; in files also on times that do not
-            rise, numbers that are not finite, and a covariance of fewer than six columns.
+            rise, numbers that are not finite, headings without a unit that fit the positions in
+            degrees, and a covariance of fewer than six columns.
     """
     text = str(source)
     places = [k for k, letter in enumerate(text) if letter == ":"]
@@ -142,13 +143,18 @@ def _path_in_csv(path: Path) -> RecordedPath:
     pose = columns.values(wanted[1:])
     notes = [file.dialect] if file.dialect else []
     if are_headings_in_degrees(pose):
-        notes.append(f"{file.path.name}: theta fits the positions in degrees: write theta [deg]")
+        raise InvalidFile(
+            file.path,
+            "expected theta in radians, but it fits the positions in degrees: "
+            + ("write radians" if entries else "write theta [deg]"),
+            file.head_line,
+        )
     cov = None
     if entries:
         upper, lower = np.triu_indices(3)
         cov = np.empty((len(time), 3, 3))
         cov[:, upper, lower] = cov[:, lower, upper] = columns.values(entries)
-    return _recorded(str(path), time, pose, cov, notes=notes)
+    return _make_path(str(path), time, pose, cov, notes=notes)
 
 
 def _path_in_tum(path: Path) -> RecordedPath:
@@ -165,7 +171,7 @@ def _path_in_tum(path: Path) -> RecordedPath:
     if not (finite := np.isfinite(pose).all(axis=1)).all():
         row = int(np.argmin(finite))
         raise file.error(numbers[row], f"expected a quaternion of norm 1, got {rows[row][4:]}")
-    return _recorded(str(path), table[:, 0], pose, None)
+    return _make_path(str(path), table[:, 0], pose, None)
 
 
 def _check_rising(time: Float[np.ndarray, "K"], at: Callable[[int], str]) -> None:
@@ -176,7 +182,7 @@ def _check_rising(time: Float[np.ndarray, "K"], at: Callable[[int], str]) -> Non
         raise ValueError(f"{at(int(back[0]) + 1)}: expected a time above {before}, got {after}")
 
 
-def _recorded(
+def _make_path(
     source: str,
     time: Float[np.ndarray, "K"],
     pose: Float[np.ndarray, "K 3"],
@@ -252,7 +258,7 @@ def _path_in_bag(source: str, path: Path, inside: str) -> RecordedPath:
         usable = [message for message, fine in zip(messages, finite, strict=True) if fine]
         stamp, kept = in_order(bag, topic.name, "messages", usable, dropped, notes)
         covs = [usable[k].cov for k in kept if usable[k].cov is not None]
-    return _recorded(
+    return _make_path(
         source,
         seconds(stamp),
         pose[finite][kept],
@@ -317,7 +323,7 @@ def _path_of_frames(source: str, bag: Bag, parent: str, child: str) -> RecordedP
     if lost := int((~is_known).sum()):
         dropped["times at which a transform between is unknown"] = lost
     pose = between(*ends)[is_known]
-    return _recorded(
+    return _make_path(
         source,
         seconds(stamp)[is_known],
         pose,

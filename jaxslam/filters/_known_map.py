@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
-from jaxslam.core._numbers import held_array, is_concrete
+from jaxslam.core._numbers import as_array, is_concrete
 from jaxslam.core._record import set_field
 from jaxslam.core.validation import InvalidField
 
@@ -16,7 +16,7 @@ def hold_map(filter: Any) -> None:
 
     Raises InvalidField on invalid ones.
     """
-    landmarks, tags = held_array(filter.landmarks), filter.tags
+    landmarks, tags = as_array(filter.landmarks), filter.tags
     set_field(filter, "landmarks", landmarks)
     size, shape = len(filter.sensor.landmark), np.shape(landmarks)
     if len(shape) != 2 or shape[1] != size or shape[0] == 0:

@@ -120,7 +120,7 @@ def variables_in(graph: Graph, table: Table, factor: Factor) -> Int[np.ndarray, 
 
 def is_indefinite(information: Float[np.ndarray, "E R R"]) -> Bool[np.ndarray, "E"]:
     """Whether each information is not positive semidefinite, beyond the rounding of a file."""
-    return definite.indefinite(information, _DIGITS, _DIGITS)
+    return definite.is_indefinite(information, _DIGITS, _DIGITS)
 
 
 def label(graph: Graph, variable: int) -> str:
@@ -159,7 +159,7 @@ def _check_rows(graph: Graph, key: str, factor: Factor) -> None:
         (twice, "joins a variable to itself"),
         (~np.isfinite(z).all(axis=1), "z is not finite"),
         (~finite, "the information is not finite"),
-        (definite.asymmetric(clean, _DIGITS), "the information is not symmetric"),
+        (definite.is_asymmetric(clean, _DIGITS), "the information is not symmetric"),
         (is_indefinite(clean), "the information is not positive semidefinite"),
     ):
         if (bad & valid).any():

@@ -211,6 +211,8 @@ def segments(
         require("sigma_angle", sigma_angle, finite(least=0.0))
         require("trim", trim, finite(least=0.0))
         require("least", least, at_least(3))
+
+    # The beams that met an obstacle.
     usable = np.isfinite(angle)
     angle, distance, valid = angle[usable], distance[usable], valid[usable]
     step = np.diff(angle)
@@ -227,6 +229,7 @@ def segments(
     def line_of(run: Int[np.ndarray, "n"]) -> tuple[np.ndarray, np.ndarray, float]:
         return fit_line(angle[run], distance[run], *noise)
 
+    # Pieces of walls: split, then merged.
     pieces = [
         piece
         for run in _runs(angle, distance, sigma)
@@ -237,6 +240,8 @@ def segments(
     # Without the short ones between them, pieces of one wall may be neighbours.
     long = [piece for piece in pieces if len(piece) >= least]
     pieces = _merge(long, angle, distance, noise, trim)
+
+    # Pieces that are no walls.
     misfit = [line_of(piece)[2] for piece in pieces]
     gain = chi2_quantile(probability, 1)  # of a further parameter
 
@@ -252,6 +257,8 @@ def segments(
         return together <= misfit[k] + misfit[after] + gain
 
     arcs = [is_arc(k) for k in range(len(pieces))]
+
+    # Lines.
     rows, counted = [], 0
     for k, piece in enumerate(pieces):
         run = piece[trim : len(piece) - trim]

@@ -131,7 +131,9 @@ class Unscented(Linearizer):
         return centre, by_pose, cov
 
     def _fit(self, f: Callable[[Array], Array], root: Array) -> _Regression:
-        alpha = _spread(root) if self.alpha is None else jnp.asarray(self.alpha, root.dtype)
+        alpha: float | Array = 1e-3 if root.dtype == jnp.float64 else 0.1
+        if self.alpha is not None:
+            alpha = jnp.asarray(self.alpha, root.dtype)
         return regress(f, root, alpha)
 
 
@@ -168,8 +170,3 @@ def _root(cov: Array) -> Array:
     floor = float(jnp.finfo(cov.dtype).eps) ** 0.5
     pivots = jnp.diagonal(root)
     return root + jnp.diag(jnp.where(pivots > floor, 0.0, floor))
-
-
-def _spread(root: Array) -> float:
-    """The default of alpha, by the dtype of a root of P."""
-    return 1e-3 if root.dtype == jnp.float64 else 0.1

@@ -49,7 +49,7 @@ def is_concrete(*values: object) -> bool:
     return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values))
 
 
-def held_array(values: ArrayLike) -> ArrayLike:
+def as_array(values: ArrayLike) -> ArrayLike:
     """An array unchanged; numbers in lists or tuples as an array of float64 on the host."""
     if hasattr(values, "dtype"):
         return values

@@ -12,7 +12,7 @@ _ROUNDED = 100
 """How many n eps of a unit diagonal rounding may leave of an eigenvalue that should be 0."""
 
 
-def asymmetric(
+def is_asymmetric(
     matrix: Float[np.ndarray, "*batch n n"], tolerance: float = 0.0
 ) -> Bool[np.ndarray, "*batch"]:
     """Whether entries differ from those across the diagonal by more than a share of √(a_ii a_jj).
@@ -23,7 +23,7 @@ def asymmetric(
     return np.asarray((off > _tolerance(matrix, tolerance)).any(axis=(-1, -2)))
 
 
-def indefinite(
+def is_indefinite(
     matrix: Float[np.ndarray, "*batch n n"], tolerance: float = 0.0, least: float = 0.0
 ) -> Bool[np.ndarray, "*batch"]:
     """Whether an eigenvalue of symmetric matrices, with a unit diagonal, is negative.
@@ -41,7 +41,7 @@ def indefinite(
     return np.asarray((variance < -rounding).any(axis=-1) | negative)
 
 
-def invertible(matrix: Float[np.ndarray, "*batch n n"]) -> Bool[np.ndarray, "*batch"]:
+def is_invertible(matrix: Float[np.ndarray, "*batch n n"]) -> Bool[np.ndarray, "*batch"]:
     """Whether symmetric matrices are positive definite and have an inverse of some digits."""
     variance = np.diagonal(matrix, axis1=-2, axis2=-1)
     unit = np.where(variance > 0, variance, 1.0)

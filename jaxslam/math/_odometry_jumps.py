@@ -26,7 +26,7 @@ LONG = 10.0
 def odometry_jumps(
     path: Float[np.ndarray, "n 3"], time: Float[np.ndarray, "n"] | None
 ) -> Bool[np.ndarray, "n"]:
-    """Which poses of odometry are not reached by motion from the previous one; never the first.
+    """Mask of the poses of odometry that no motion from the previous one leads to; never the first.
 
     The usual speed, and turn rate, is the 95 % quantile of those steps of the log that are not
     faster than 3 m/s, 180°/s; of all of them if most are faster. A step is a jump if its speed or
@@ -63,7 +63,7 @@ def odometry_jumps(
 def lost_lines(
     path: Float[np.ndarray, "n 3"], jump: Bool[np.ndarray, "n"]
 ) -> Bool[np.ndarray, "n"]:
-    """Which lines of a true path a tracker wrote while it had lost the robot.
+    """Mask of the lines of a true path that a tracker wrote while it had lost the robot.
 
     It repeats a pose, its last one or zero, so that the path jumps before or after. Lost are lines
     that repeat the pose before a jump, but for the first of them, lines that repeat the pose after

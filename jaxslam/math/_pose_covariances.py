@@ -10,7 +10,7 @@ _ROUNDING = 32
 
 
 class CovarianceFaults(NamedTuple):
-    """Where a claimed pose covariance is none, by more than rounding."""
+    """Masks of the steps whose claimed pose covariance is none, by more than rounding."""
 
     asymmetric: Bool[np.ndarray, "*steps"]
     indefinite: Bool[np.ndarray, "*steps"]
@@ -20,7 +20,7 @@ class CovarianceFaults(NamedTuple):
 def covariance_faults(
     pose: Float[np.ndarray, "*steps 3"], cov: Float[np.ndarray, "*steps 3 3"]
 ) -> CovarianceFaults:
-    """Where a pose covariance is not symmetric, or not positive semi-definite.
+    """The steps whose pose covariance is not symmetric, or not positive semi-definite.
 
     P is scaled by `inverse_deviations`, so that its entries are correlations. It is not
     symmetric where p_ij and p_ji differ by more than ∛eps, and indefinite where the least

@@ -9,7 +9,7 @@ from jaxslam.core.noise import NoiseCov
 from jaxslam.core.protocols import Motion
 from jaxslam.core.validation import finite, positive
 from jaxslam.math import se2
-from jaxslam.math._arrays import Control, Pose, ProcessNoise, StepJacobians, held_array
+from jaxslam.math._arrays import Control, Pose, ProcessNoise, StepJacobians, as_array
 
 
 @record
@@ -40,7 +40,7 @@ class Ackermann(Motion):
 
     noise_cov: NoiseCov
     """(2, 2) covariance of w on (v_e, α), or a function of (pose, u)."""
-    wheelbase: ArrayLike = field(default=2.83, check=lambda length: held_array(positive(length)))
+    wheelbase: ArrayLike = field(default=2.83, check=lambda length: as_array(positive(length)))
     """L [m], from the rear to the front axle; positive."""
     sensor: ArrayLike = field(default=(3.78, 0.5), check=finite(2))
     """(2,) = (a, b) [m]."""

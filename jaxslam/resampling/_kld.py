@@ -48,7 +48,7 @@ def bins_of(pose: Float[Array, "P 3"], size: tuple[float, float, float]) -> Int[
     return jnp.floor(jnp.clip(at, -_FARTHEST, _FARTHEST)).astype(jnp.int32)
 
 
-def occupied(bins: Int[Array, "P 3"]) -> Int[Array, "P"]:
+def count_distinct(bins: Int[Array, "P 3"]) -> Int[Array, "P"]:
     """The number of distinct rows among the first 1, 2, …, P bins, int32.
 
     By a stable sort, O(P log P) in time and O(P) in memory for any size of the world: among equal
@@ -78,7 +78,7 @@ def enough(
     """
     count = bins.shape[0]
     size = jnp.arange(1, count + 1)
-    bound = kld_bound(occupied(bins), error, confidence)
+    bound = kld_bound(count_distinct(bins), error, confidence)
     fits = (size >= least) & (size.astype(bound.dtype) >= bound)
     some = fits.any()
     return jnp.where(some, jnp.argmax(fits) + 1, count).astype(jnp.int32), ~some

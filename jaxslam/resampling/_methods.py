@@ -13,7 +13,7 @@ from jaxslam.core._record import field, function_of, record
 from jaxslam.core.protocols import Resample
 from jaxslam.core.validation import in_range
 from jaxslam.math._arrays import Number
-from jaxslam.resampling._weights import at_points, even, normalized, weights_of
+from jaxslam.resampling._weights import at_points, even, normalize, weights_of
 
 
 def multinomial(log_weights: Float[Array, "P"], key: Array) -> Int[Array, "P"]:
@@ -118,7 +118,7 @@ class Soft:
     def __call__(
         self, log_weights: Float[Array, "P"], key: Array
     ) -> tuple[Int[Array, "P"], Float[Array, "P"]]:
-        log_w = normalized(log_weights)[0]
+        log_w = normalize(log_weights)[0]
         w = jnp.exp(log_w)
         share = jnp.asarray(self.share, w.dtype)
         q = share * w + (1 - share) / w.shape[0]
@@ -129,7 +129,7 @@ class Soft:
         positive = w > 0
         ratio = jnp.where(positive, log_w, 0.0) - jnp.where(positive, log_q, 0.0)
         ratio = jnp.where(positive, ratio, -jnp.inf)[ancestor]
-        _, log_sum, some = normalized(jax.lax.stop_gradient(ratio))
+        _, log_sum, some = normalize(jax.lax.stop_gradient(ratio))
         return ancestor, jnp.where(some, ratio - log_sum, even(log_weights))
 
 
@@ -159,7 +159,7 @@ class StopGradient:
     def __call__(
         self, log_weights: Float[Array, "P"], key: Array
     ) -> tuple[Int[Array, "P"], Float[Array, "P"]]:
-        log_w, _, some = normalized(log_weights)
+        log_w, _, some = normalize(log_weights)
         ancestor = self.resample(jax.lax.stop_gradient(log_weights), key)
         chosen = jnp.where(some, log_w, 0.0)[ancestor]
         # Particles of weight zero are not drawn; the where keeps gradients of the others finite.

@@ -14,7 +14,7 @@ from jaxslam.math._xla import where_any
 _T = TypeVar("_T")
 
 
-def normalized(
+def normalize(
     log_weights: Float[Array, "P"],
 ) -> tuple[Float[Array, "P"], Float[Array, ""], Bool[Array, ""]]:
     """Normalized log-weights (Σ w = 1), log Σ exp(log_weights), and whether that sum is positive.
@@ -77,7 +77,7 @@ def resampled_where(
 
 def weights_of(log_weights: Float[Array, "P"]) -> Float[Array, "P"]:
     """Weights w with Σ w = 1 of log-weights of any scale; equal where all underflow."""
-    return jnp.exp(normalized(log_weights)[0])
+    return jnp.exp(normalize(log_weights)[0])
 
 
 def effective_size(log_weights: Float[Array, "P"]) -> Float[Array, ""]:

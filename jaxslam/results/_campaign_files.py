@@ -153,9 +153,10 @@ def load(folder: str | Path) -> Campaign:
     """
     folder = Path(folder)
     if not (folder / BLOCKS).is_dir():
-        raise InvalidField(
-            "", f"there is no campaign in {folder}: expected {BLOCKS}/ there", owner="jaxslam.load"
-        )
+        reason = f"there is no campaign in {folder}: expected {BLOCKS}/ there"
+        if (folder / RESULT).exists():  # of `jaxslam judge`, or of `Campaign.save`
+            reason += ", the runs, which jaxslam consistency alone keeps"
+        raise InvalidField("", reason, owner="jaxslam.load")
     kept, path = store.resume(folder / BLOCKS), folder / RESULT
     try:
         result = json.loads(path.read_text(encoding="utf-8"))

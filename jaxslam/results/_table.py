@@ -116,8 +116,9 @@ def rows_of(campaign: Campaign, names: Sequence[str]) -> list[Row]:
     nis = [s.nis_band and Figure("[{:.4f}, {:.4f}]".format(*s.nis_band)) for s in summaries]
     half_widths = [s.autocorrelation_band[0] for s in summaries]
     white = [Figure(f"± {half:.4f}") if np.isfinite(half) else None for half in half_widths]
-    rows.append(Row(f"NIS / dof, {percentage(LEVEL)} band", "", nis, group="Bands"))
-    rows.append(Row(f"autocorrelation, {percentage(LEVEL)} band", "", white, group="Bands"))
+    for name, bands in (("NIS / dof", nis), ("autocorrelation", white)):
+        if any(band is not None for band in bands):
+            rows.append(Row(f"{name}, {percentage(LEVEL)} band", "", bands, group="Bands"))
     for block in DOF:
         shares = [s.inside.get(block) for s in summaries]
         figures = [None if p is None else Figure(percentage(p, 1), p) for p in shares]
@@ -179,10 +180,10 @@ def lost_runs(campaign: Campaign) -> list[tuple[str, str]]:
     phrases = []
     for name, summary in campaign.filters.items():
         if summary.faults:
-            reasons = (f"{why} in runs {_listed(runs)}" for why, runs in summary.faults.items())
+            reasons = (f"{why} in {_listed(runs)}" for why, runs in summary.faults.items())
             phrases.append((name, f"is not judged in some runs: {'; '.join(reasons)}"))
         elif summary.not_finite_runs:
-            phrases.append((name, f"was not finite in runs {_listed(summary.not_finite_runs)}"))
+            phrases.append((name, f"was not finite in {_listed(summary.not_finite_runs)}"))
     return phrases
 
 
@@ -248,5 +249,6 @@ def notes_on_pairs(comparisons: Sequence[Comparison]) -> list[tuple[str, str]]:
 
 
 def _listed(numbers: Sequence[int]) -> str:
-    """The first twenty numbers of runs."""
-    return ", ".join(map(str, numbers[:20])) + (", …" if len(numbers) > 20 else "")
+    """The first twenty numbers of runs, as "runs 1, 2"."""
+    listed = ", ".join(map(str, numbers[:20])) + (", …" if len(numbers) > 20 else "")
+    return f"run{'s' * (len(numbers) != 1)} {listed}"

@@ -23,7 +23,7 @@ from jaxslam.math._arrays import (
     Unmeasured,
     is_concrete,
 )
-from jaxslam.math._definite import invertible
+from jaxslam.math._definite import is_invertible
 
 FreeLike = Free | tuple[ArrayLike, ArrayLike]
 
@@ -45,7 +45,7 @@ def prior(size: int) -> Check:
         if is_concrete(mean) and not (_is_real(mean) and np.all(np.isfinite(mean))):
             raise ValueError(f"expected a finite prior mean, got {mean}")
         covariance(size)(cov)
-        if is_concrete(cov) and not invertible(np.asarray(cov)):
+        if is_concrete(cov) and not is_invertible(np.asarray(cov)):
             raise ValueError("expected a positive definite prior covariance")
         return Free(mean, cov)
 

@@ -112,7 +112,7 @@ def part_scan(
     tags: Int[Array, "C"],
     key: Array,
 ) -> tuple[Scan, Int[Array, "T"]]:
-    """The `sensor_scans` one part of a suite, in its measurement slots and at its rate.
+    """The `sensor_scans` of one part of a suite, in its measurement slots and at its rate.
 
     tags: of the targets. An absolute sensor has no tag. Without targets nothing is measured.
     """

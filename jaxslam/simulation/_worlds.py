@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from jaxslam._origin import FAR, far_origin, move_near_origin, to_map_coordinates
 from jaxslam._public import publish
-from jaxslam.core._numbers import held_array, is_concrete
+from jaxslam.core._numbers import as_array, is_concrete
 from jaxslam.core._record import FrozenDict, field, function_of, record, set_field, static
 from jaxslam.core._validation import reworded_tracer_errors
 from jaxslam.core.protocols import Component, Motion, Sensor
@@ -373,7 +373,7 @@ def _table_of(columns: tuple[str, ...]) -> Check:
             table = np.asarray(value)
             if not np.issubdtype(table.dtype, np.number) or not np.all(np.isfinite(table)):
                 raise ValueError("expected finite numbers")
-        return held_array(value)
+        return as_array(value)
 
     return check
 

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike
 
-from jaxslam.core._numbers import held_array, is_concrete
+from jaxslam.core._numbers import as_array, is_concrete
 from jaxslam.core._record import field, record, set_field, static
 from jaxslam.core._reprs import short_repr
 from jaxslam.core.protocols import Motion
@@ -47,7 +47,7 @@ def _angles_of_beams(value: ArrayLike) -> ArrayLike:
     shape = np.shape(value)
     if len(shape) != 1 or 0 in shape or (is_concrete(value) and not np.all(np.isfinite(value))):
         raise ValueError(f"expected finite angles (at least 1,), got {shape}")
-    return held_array(value)
+    return as_array(value)
 
 
 @record
@@ -87,7 +87,7 @@ class LaserWorld:
 
     def __post_init__(self) -> None:
         for name in ("controls", "pose"):
-            set_field(self, name, held_array(getattr(self, name)))
+            set_field(self, name, as_array(getattr(self, name)))
 
 
 class LaserHistory(NamedTuple):

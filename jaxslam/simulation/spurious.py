@@ -9,17 +9,11 @@ from jaxslam.core._numbers import is_concrete
 from jaxslam.core._record import field, record, static
 from jaxslam.core.protocols import Sensor
 from jaxslam.core.types import Scan
-from jaxslam.core.validation import InvalidField, finite, in_range
+from jaxslam.core.validation import InvalidField, in_range, not_negative
 from jaxslam.math._arrays import Number
 from jaxslam.math._linalg import root_psd
 
 __all__ = ["Spurious"]
-
-
-def _at_least_zero(value: Number) -> Number:
-    """The check of a finite number >= 0."""
-    finite(least=0.0)(value)
-    return value
 
 
 @record
@@ -31,7 +25,7 @@ class Spurious:
     or false measurements without a reach.
     """
 
-    clutter: float = static(default=0.0, check=_at_least_zero)
+    clutter: float = static(default=0.0, check=not_negative)
     """false measurements a scan, on average: binomial, over 2·clutter further slots, rounded up"""
     missed: Number = field(default=0.0, check=in_range(0.0, 1.0))
     """probability that a landmark in view is not measured"""
@@ -40,7 +34,7 @@ class Spurious:
     mislabelled: Number = field(default=0.0, check=in_range(0.0, 1.0))
     """probability that a tag is wrong: the wrong ones of a scan are permuted in a cycle (a single
     one keeps its own)"""
-    reach: Number = field(default=0.0, check=_at_least_zero)
+    reach: Number = field(default=0.0, check=not_negative)
     """[m]"""
 
     def __post_init__(self) -> None:
@@ -52,7 +46,7 @@ class Spurious:
 
     @property
     def places(self) -> int:
-        """How many measurement slots clutter adds to a scan."""
+        """The number of measurement slots that clutter adds to a scan."""
         return int(np.ceil(2 * self.clutter))
 
     def spoil(

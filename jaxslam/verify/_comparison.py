@@ -24,7 +24,7 @@ _NOTHING = 1e-9
 def compare_methods(
     evaluated: Evaluated, tolerance: float, float32_tolerance: float
 ) -> list[Finding]:
-    """One finding for each argument: the methods compared entry by entry.
+    """A finding for each argument: the methods compared entry by entry.
 
     States at which the function has no finite value are left out; another check reports them.
     A Jacobian without entries, as by a landmark of no numbers, has no finding.
@@ -75,7 +75,7 @@ class _Compared(NamedTuple):
 
 
 def _compare(evaluation: Jacobians, tolerance: float, float32_tolerance: float) -> _Compared:
-    """All differences between the methods, relative to their tolerances."""
+    """The differences between the methods, relative to their tolerances."""
     gap, scale = _largest_gap(evaluation.methods)
     gap32, scale32 = _largest_gap(evaluation.single)
     away, error, lost, nothing_compared = np.zeros_like(gap), np.zeros_like(gap), 0, False

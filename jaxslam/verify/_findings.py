@@ -173,7 +173,7 @@ class Report:
             verdict += "; no hand-derived claim"
         if 0 < len(unclaimed) < len(self.findings):
             verdict += f" of {', '.join(unclaimed)}"
-        lines = _wrapped(f"{self.kind} {self.model}: {verdict}", 0)
+        lines = _wrap(f"{self.kind} {self.model}: {verdict}", 0)
         for finding in self.findings:
             lines += [f"  {line}" for line in finding.lines()]
         for check in self.checks:
@@ -181,9 +181,9 @@ class Report:
                 lines.append(f"  {check}")
         held = "; ".join(check.name for check in self.checks if check.passed)
         if held:
-            lines += _wrapped(f"ok    {held}", 2)
+            lines += _wrap(f"ok    {held}", 2)
         for note in self.notes:
-            lines += _wrapped(f"note  {note}", 2)
+            lines += _wrap(f"note  {note}", 2)
         if self.linearity is not None:
             lines.append(f"  linearity index {self.linearity:.3g}, median (3 σ of 0.1 m, 0.05 rad)")
         return "\n".join(lines)
@@ -243,7 +243,7 @@ def report_table(reports: Sequence[Report]) -> str:
     return "\n".join([text[0], "-" * max(map(len, text)), *text[1:], "", *_COLUMNS])
 
 
-def _wrapped(text: str, indent: int) -> list[str]:
+def _wrap(text: str, indent: int) -> list[str]:
     """A sentence in lines of at most 100 characters."""
     others = " " * max(indent, 6)
     return textwrap.wrap(text, 100, initial_indent=" " * indent, subsequent_indent=others)

@@ -80,7 +80,7 @@ def evaluate_jacobians(function: Function, samples: Samples) -> Evaluated:
 
 
 class _Evaluator:
-    """One evaluation of a function, which collects checks on its way."""
+    """The evaluation of a function, which collects checks on its way."""
 
     def __init__(self, function: Function, samples: Samples):
         self.function, self.samples = function, samples

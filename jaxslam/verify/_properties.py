@@ -198,7 +198,7 @@ def _inversion_error(sensor: Sensor, seen: Samples) -> str:
 def _residual_error(
     residual: Callable[[Values, Values], jax.Array], z: Values, z_hat: Values, circle: Values
 ) -> str:
-    """What is wrong with residual(z, ẑ) = z - ẑ modulo the periods, or ""."""
+    """The fault of residual(z, ẑ) = z - ẑ modulo the periods, or ""."""
     plain = np.asarray(residual(z, z_hat))
     circular = np.isfinite(circle)
     period = np.where(circular, circle, 1.0)
@@ -219,7 +219,7 @@ def _residual_error(
 def _covariances(
     noise_cov: Callable[..., jax.Array], arguments: tuple[Values, ...], size: int
 ) -> str:
-    """What is wrong with the noise covariances of `size` numbers at some arguments, or ""."""
+    """The fault of the noise covariances of `size` numbers at some arguments, or ""."""
     covs = np.asarray(quick_jit(jax.vmap(noise_cov))(*arguments))
     if covs.shape[1:] != (size, size):
         return f"noise_cov returns shape {covs.shape[1:]}, expected ({size}, {size})"
@@ -232,7 +232,7 @@ def _covariances(
 
 
 def _deviation(difference: ArrayLike, circle: Float[np.ndarray, "m"]) -> str:
-    """How far a difference is from zero modulo the periods, or "" within rounding."""
+    """The size of a difference modulo the periods, as text, or "" within rounding."""
     off = modulo_periods(np.asarray(difference, np.float64), circle)
     worst = float(np.max(np.abs(np.where(np.isnan(off), np.inf, off)), initial=0.0))
     return "" if worst <= _ROUNDING else f"off by {worst:.3g} relative to the coordinates"
@@ -263,7 +263,7 @@ def _pure(function: Function, evaluated: Evaluated) -> str:
 
 
 def _dtypes(function: Function, samples: Samples) -> str:
-    """Which dtype is not kept, or ""."""
+    """The dtype that is not kept, or ""."""
     for dtype in (np.float32, np.float64):
         shapes = (jax.ShapeDtypeStruct(a.shape[1:], dtype) for a in samples.values)
         result = jax.eval_shape(function.call, *shapes)

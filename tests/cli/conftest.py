@@ -2,7 +2,7 @@ import jax
 import pytest
 from command import run_command
 
-from jaxslam.results.plot import _style
+from jaxslam.results.plot import Film, _film, _style
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -20,6 +20,21 @@ def undrawn():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(_style, "encode", lambda figure, kind, *_: kind.encode())
         yield
+
+
+@pytest.fixture
+def films(monkeypatch):
+    """The films that are saved, in their order, without ffmpeg."""
+    found, save = [], Film.save
+
+    def kept(film, *arguments, **options):
+        if film not in found:
+            found.append(film)
+        return save(film, *arguments, **options)
+
+    monkeypatch.setattr(Film, "save", kept)
+    monkeypatch.setattr(_film.shutil, "which", lambda name: None)
+    return found
 
 
 @pytest.fixture

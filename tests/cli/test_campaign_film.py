@@ -3,7 +3,6 @@
 import jax
 import pytest
 import worlds
-from matplotlib.animation import FFMpegWriter
 from PIL import Image, ImageChops
 
 from jaxslam import catalog, plot
@@ -11,8 +10,7 @@ from jaxslam._cli.campaigns.consistency import _write_films as write_films
 
 
 @pytest.mark.sweep
-def test_every_filter_is_filmed_in_run_0(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(FFMpegWriter, "isAvailable", lambda: False)
+def test_every_filter_is_filmed_in_run_0(tmp_path, capsys, films):
     world = worlds.ring(3)
     filters = {"dead_reckoning": catalog.ALL["dead_reckoning"](world)}
     write_films(tmp_path / "out", world, filters, 5, "float64")
@@ -20,7 +18,7 @@ def test_every_filter_is_filmed_in_run_0(tmp_path, capsys, monkeypatch):
     assert "\nfilm: ffmpeg is not installed: GIF instead of MP4\n" in printed
     moving, page = (tmp_path / "out" / f"film-dead_reckoning.{kind}" for kind in ("gif", "html"))
     assert f"wrote {moving}, {page}" in printed
-    assert page.read_text().count("data:image/png;base64,") == 3
+    assert page.read_text().count("iVBOR") == 3
     # Run 0 of this seed, not of another.
     for seed, same in ((5, True), (6, False)):
         key, title = jax.random.key(seed), "ring: dead_reckoning, run 0 of seed 5"

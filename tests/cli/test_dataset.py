@@ -6,7 +6,6 @@ import json
 import jax
 import numpy as np
 import pytest
-from matplotlib.animation import FFMpegWriter
 
 from jaxslam import _cli as cli
 from jaxslam import catalog, datasets, filters
@@ -92,10 +91,7 @@ def test_innovations_are_written_on_demand(tmp_path, undrawn):
     np.testing.assert_allclose(likely, summary["log-likelihood"], rtol=1e-9)
 
 
-def test_run_writes_films_and_says_what_is_missing(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(FFMpegWriter, "isAvailable", lambda: False)
-    scenes, film = [], plot.Film
-    monkeypatch.setattr(plot, "Film", lambda scene: scenes.append(scene) or film(scene))
+def test_run_writes_films_and_says_what_is_missing(tmp_path, capsys, films):
     data, out = write_bonn(tmp_path / "bonn"), tmp_path / "out"
     filters = ["--filters", "ekf,dead_reckoning"]
     run = ["run", "--dataset", "bonn", str(data), *filters, "--animate", "--out", str(out)]
@@ -107,8 +103,8 @@ def test_run_writes_films_and_says_what_is_missing(tmp_path, capsys, monkeypatch
     for name in ("ekf", "dead_reckoning"):
         assert (out / f"film-{name}.gif").read_bytes().startswith(b"GIF")
         assert "data:image/png;base64," in (out / f"film-{name}.html").read_text()
-    assert [scene.title for scene in scenes] == ["bonn: ekf", "bonn: dead_reckoning"]
-    assert [scenes[0].caption(k).split(": ")[1] for k in range(3)] == [
+    assert [film.title for film in films] == ["bonn: ekf", "bonn: dead_reckoning"]
+    assert [films[0].caption(k).split(": ")[1] for k in range(3)] == [
         "0 fused, 2 new, 0 dropped",
         "2 fused, 0 new, 0 dropped",
         "2 fused, 0 new, 0 dropped",

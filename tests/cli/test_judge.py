@@ -10,7 +10,8 @@ from cases import swept
 from command import run_command
 from estimates import write_estimates
 
-from jaxslam import catalog, scenarios
+from jaxslam import catalog, load, scenarios
+from jaxslam._cli.campaigns import estimator_runs
 from jaxslam.consistency import write_draws
 from jaxslam.consistency.campaign import monte_carlo
 
@@ -176,6 +177,19 @@ def test_rows_may_be_absent_where_they_are_not_judged(
         assert result(tmp_path / "out")["steps"] == 5
 
 
+def test_an_empty_file_is_one_run_that_is_not_judged(draws, estimates, tmp_path, undrawn, capsys):
+    (estimates / "0001" / "trajectory.csv").write_text("")
+    # a map without names has no measure, and no note
+    (estimates / "0000" / "map.csv").write_text("landmark,x,y,c_xx,c_xy,c_yy\n,1,1,1,0,1\n")
+    assert judge(estimates, "--draws", draws, "--out", tmp_path / "out") == 1
+    assert result(tmp_path / "out")["filters"]["mine"]["faults"] == {"ends early": [1]}
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "1 of 3 runs is not judged: 1 ends early (run 1: trajectory.csv is empty): " in printed
+    assert "mine is not judged in some runs: ends early in run 1" in printed
+    assert "NIS" not in printed.split("honest:")[0] and "autocorrelation" not in printed
+    assert "landmark" not in printed
+
+
 def test_numbers_that_are_not_finite_are_counted(draws, estimates, tmp_path, undrawn):
     path = estimates / "0001" / "trajectory.csv"
     lines = path.read_text().splitlines()
@@ -233,6 +247,71 @@ def test_a_program_is_run_once_a_run_and_again_where_it_failed(
     )
 
 
+@pytest.mark.parametrize("what", ["script", "log"])
+def test_an_estimate_of_another_program_or_of_other_draws_is_not_judged(
+    draws, estimates, tmp_path, undrawn, refused, world, what
+):
+    script, folder, of = tmp_path / "filter.py", tmp_path / "theirs", draws
+    script.write_text(PROGRAM)
+    command = f"{sys.executable} {script} {{run}} {{estimate}} {estimates}"
+    options = ["--estimator", command, "--out", tmp_path / "out", *ONE]
+    assert run_command(["judge", folder, "--draws", draws, *options]) == 0
+    before = read(folder, 0)
+    if what == "script":
+        script.write_text(PROGRAM + "# a mended line")
+        message = f"0000 holds an estimate of another {script}, which changed since: choose"
+    else:
+        of = tmp_path / "other"
+        write_draws(world, RUNS, jax.random.key(9), of, options=OPTIONS)
+        message = f"0000 holds an estimate of other draws than {of}: choose another folder"
+        refused(  # without the program, too
+            ["judge", folder, "--draws", of, "--out", tmp_path / "out", *ONE],
+            f"judge.json: expected an estimate of {of}, got one of other draws",
+        )
+    refused(["judge", folder, "--draws", of, *options], message)
+    np.testing.assert_array_equal(read(folder, 0), before)
+
+
+def test_ctrl_c_says_what_is_finished(draws, estimates, tmp_path, monkeypatch, capsys):
+    (tmp_path / "filter.py").write_text(PROGRAM)
+    command = f"{sys.executable} {tmp_path / 'filter.py'} {{run}} {{estimate}} {estimates}"
+
+    def stop(progress, finished, runs):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(estimator_runs.Progress, "__call__", stop)
+    words = [tmp_path / "theirs", "--draws", draws, "--estimator", command, "--processes", "1"]
+    assert judge(*words, "--out", tmp_path / "out") == 130
+    finished = len(list((tmp_path / "theirs").iterdir()))
+    assert 1 <= finished < RUNS
+    text = f"interrupted; {tmp_path / 'theirs'} has {finished} of 3 runs; the same command goes on"
+    assert text in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_columns_are_compared_in_pairs(draws, estimates, tmp_path, undrawn, capsys):
+    theirs = honest(draws, tmp_path / "theirs")
+    for number in range(RUNS):  # of the same errors, with twice the standard deviations
+        write(theirs, number, read(theirs, number), cov="0.04,0,0,0.04,0,0.04")
+    options = ["--draws", draws, "--out", tmp_path / "out"]
+    assert judge(estimates, theirs, *options, "--compare", "mine") == 0
+    assert "3 runs in pairs" in capsys.readouterr().out
+    pairs = result(tmp_path / "out")["pairs"]
+    assert pairs["reference"] == "mine" and list(pairs["filters"]) == ["theirs"]
+    nees = pairs["filters"]["theirs"]["measures"]["nees_pose"]
+    gap = []
+    for number in range(RUNS):
+        true = np.loadtxt(draws / f"truth/{number:04d}/truth.csv", delimiter=",", skiprows=1)
+        error = true[:, 1:] - read(estimates, number)[:, 1:]
+        error[:, 2] = (error[:, 2] + np.pi) % (2 * np.pi) - np.pi
+        gap.append(((error**2).sum(axis=1) * (1 / 0.04 - 1 / 0.01)).mean())
+    assert nees["difference"]["value"] == pytest.approx(np.mean(gap), rel=1e-9)
+    with pytest.raises(
+        ValueError, match="blocks/ there, the runs, which jaxslam consistency alone"
+    ):
+        load(tmp_path / "out")
+
+
 def change_line(path, number, text):
     lines = path.read_text().splitlines()
     lines[number] = text
@@ -252,6 +331,14 @@ NINE = ",".join("0" * 9)
         ),
         (None, ["--every", "3"], "--every: expected a divisor of the 20 steps, got 3"),
         (None, ["--runs", "9"], "--runs: expected at most 3"),
+        (
+            None,
+            ["--compare", "min"],
+            "--compare: expected one of ESTIMATES and --filters, mine, got",
+        ),
+        (None, ["--compare", "mine"], "--compare: expected two columns or more, got 1"),
+        (None, ["--gap", "2"], "--gap: expected none without --estimate and --truth"),
+        (None, ["--align", "best"], "--align: expected none without --estimate and --truth"),
         (None, ["--filters", "magic"], "--filters: unknown filter 'magic'"),
         (None, ["--time-limit", "0"], "--time-limit: expected a number above 0, got 0"),
         (None, ["--estimator", "prog {run}"], "expected a command with {run} and {estimate}"),

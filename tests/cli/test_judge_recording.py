@@ -71,6 +71,24 @@ def test_what_is_printed_and_written(bag, tmp_path, capsys):
         assert image.width > 1000
 
 
+def test_errors_alone_are_drawn_without_a_covariance(bag, tmp_path):
+    words = ["--estimate", f"{bag}:/mocap/pose", "--truth", f"{bag}:/mocap/pose"]
+    assert judge_recording.run(parsed(*words, "--out", tmp_path / "out")) == 0
+    with Image.open(tmp_path / "out" / "errors.png") as picture:
+        assert picture.size[0] > 500
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["verdict"] == "incomplete"
+
+
+def test_options_of_draws_are_refused_beside_a_recording(tmp_path, refused):
+    (tmp_path / "a.tum").write_text("1 0 0 0 0 0 0 1\n2 0 0 0 0 0 0 1\n")
+    words = ["judge", "--estimate", tmp_path / "a.tum", "--truth", tmp_path / "a.tum"]
+    for option in (["--every", "2"], ["--filters", "ekf"], ["--bound"], ["--runs", "3"]):
+        refused(
+            [*words, *option, "--out", tmp_path / "out"],
+            f"{option[0]}: expected none beside --estimate and --truth",
+        )
+
+
 def test_options_reach_the_scores(bag, tmp_path, capsys):
     words = ["--estimate", f"{bag}:/amcl_pose", "--truth", f"{bag}:/mocap/pose"]
     options = parsed(

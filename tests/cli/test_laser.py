@@ -10,7 +10,6 @@ import jax
 import numpy as np
 import pytest
 import yaml
-from matplotlib.animation import FFMpegWriter
 from PIL import Image
 from reference.walls import is_free
 from ring_of_rooms import FAR, ranges_of
@@ -19,7 +18,7 @@ from jaxslam import _cli as cli
 from jaxslam import datasets, grids
 from jaxslam.core.types import Estimate
 from jaxslam.math import numpy_poses as poses
-from jaxslam.results import plot, report
+from jaxslam.results import report
 from jaxslam.simulation.laser import scan_world
 from jaxslam.simulation.scenarios import square
 from jaxslam.simulation.walls import make_walls, rasterize
@@ -140,20 +139,15 @@ def test_a_log_that_ends_in_a_line_is_refused_with_the_line(log_file, tmp_path, 
     assert not out.exists()
 
 
-def test_laser_slam_writes_a_film_of_the_map_growing(
-    log_file, tmp_path, capsys, undrawn, monkeypatch
-):
-    monkeypatch.setattr(FFMpegWriter, "isAvailable", lambda: False)
-    scenes, film = [], plot.Film
-    monkeypatch.setattr(plot, "Film", lambda scene: scenes.append(scene) or film(scene))
+def test_laser_slam_writes_a_film_of_the_map_growing(log_file, tmp_path, capsys, undrawn, films):
     out = tmp_path / "out"
     assert run("slam", log_file.path, out, "--scans", ":2", "--max-range", "10", "--animate") == 0
     assert "\nfilm: ffmpeg is not installed: GIF instead of MP4\n" in capsys.readouterr().out
     assert (out / "film.gif").read_bytes().startswith(b"GIF")
     assert "data:image/png;base64," in (out / "film.html").read_text()
-    (scene,) = scenes
-    assert scene.title == "room"
-    assert [scene.caption(k) for k in range(3)] == [
+    (film,) = films
+    assert film.title == "room"
+    assert [film.caption(k) for k in range(3)] == [
         "laser odometry, scan 1 of 2",
         "laser odometry, scan 2 of 2",
         "after closing by 0 loops",

@@ -13,17 +13,6 @@ from reference import graph as plain
 from jaxslam import _cli as cli
 from jaxslam import datasets, graphs
 from jaxslam.results import plot
-from jaxslam.results.plot import _film
-
-
-class Film:
-    """A film that is not drawn."""
-
-    def __init__(self, scene, fps):
-        self.scene = scene
-
-    def save(self, path, **options):
-        path.write_text("film")
 
 
 def small():
@@ -41,7 +30,7 @@ def file(tmp_path_factory):
     return path
 
 
-def test_it_writes_the_optimum(file, tmp_path, capsys, monkeypatch):
+def test_it_writes_the_optimum(file, tmp_path, capsys, monkeypatch, films):
     drawn = {}
     draw = plot.graph_figure
 
@@ -49,10 +38,7 @@ def test_it_writes_the_optimum(file, tmp_path, capsys, monkeypatch):
         drawn.update(before=before, after=after, **more)
         return draw(before, after, squared, **more)
 
-    films = []
     monkeypatch.setattr(plot, "graph_figure", graph_figure)
-    monkeypatch.setattr(_film, "mp4_problem", lambda: "ffmpeg is not installed")
-    monkeypatch.setattr(plot, "Film", lambda *a, **b: films.append(Film(*a, **b)) or films[-1])
     out = tmp_path / "out"
     assert (
         cli.main(
@@ -92,10 +78,10 @@ def test_it_writes_the_optimum(file, tmp_path, capsys, monkeypatch):
     np.testing.assert_array_equal(drawn["after"].poses, found)
     assert "converged: χ² = " in drawn["subtitles"][1]
     # The film's last iterate is the optimum.
-    (scene,) = [film.scene for film in films]
-    assert scene.frames == 1 + summary["iterations"]
-    assert scene.caption(0) == f"start, χ² = {summary['chi2 at the start']:.6g}"
-    assert scene.caption(summary["iterations"]).endswith(f"χ² = {summary['chi2']:.6g}")
+    (film,) = films
+    assert film.frames == 1 + summary["iterations"]
+    assert film.caption(0) == f"start, χ² = {summary['chi2 at the start']:.6g}"
+    assert film.caption(summary["iterations"]).endswith(f"χ² = {summary['chi2']:.6g}")
 
     for part in (
         "χ² = Σ eᵀ Ω e, without a factor ½; of relative poses e = Z⁻¹ ∘ (Xᵢ⁻¹ ∘ Xⱼ) as (x, y, θ)",

@@ -239,6 +239,18 @@ def test_errors_alone_without_covariances():
     assert "no covariance" in scores.doubts[0]
 
 
+def test_a_truth_in_another_frame_is_noticed():
+    estimate, (time, path), _ = recorded(np.random.default_rng(3), 300)
+    moved = poses.compose(np.array([30.0, -20.0, 0.5]), path)
+    (doubt,) = (d for d in judge_recording(estimate, (time, moved)).doubts if "rigid" in d)
+    assert "if the two are in different frames, align best" in doubt
+    before = np.sqrt(((moved - estimate[1])[:, :2] ** 2).sum(axis=1).mean())
+    assert f"from {before:.3g} m" in doubt
+    for align, truth in (("none", path), ("best", moved)):
+        scores = judge_recording(estimate, (time, truth), align=align)
+        assert not any("frames" in doubt for doubt in scores.doubts)
+
+
 def test_the_best_alignment_is_undone_whatever_the_frame():
     """And it minimizes Σ eᵀ P⁻¹ e: a small motion of the frame makes it no smaller."""
     (time, pose, cov), (clock, path), _ = recorded(np.random.default_rng(11), 300, 5)
@@ -322,6 +334,12 @@ COV = np.tile(np.eye(3), (20, 1, 1))
 
 @refused(
     ((TIME, PATH[:5], None), (TIME, PATH), {}, r"estimate: expected times \(n,\) and poses"),
+    (
+        (TIME, PATH * [1, 1, 180 / np.pi], None),
+        (TIME, PATH),
+        {},
+        "estimate: expected headings in radians, got some that fit the positions in degrees",
+    ),
     (
         (TIME[::-1], PATH, None),
         (TIME, PATH),

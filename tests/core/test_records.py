@@ -16,7 +16,7 @@ from layouts import kept_programs, wrong_layouts
 from own_models import motion_of, sensor_of
 
 import jaxslam
-from jaxslam import World, catalog, filters, motion, run, sensors, simulate, smoothing
+from jaxslam import World, catalog, filters, linearize, motion, run, sensors, simulate, smoothing
 from jaxslam.core._record import is_record
 from jaxslam.core.protocols import Filter, Motion
 from jaxslam.core.record import field, function_of, record, static
@@ -27,6 +27,7 @@ from jaxslam.core.validation import (
     at_least,
     finite,
     is_concrete,
+    not_negative,
     one_of,
     or_none,
     positive,
@@ -119,6 +120,14 @@ class Still(World):
     """A world that draws nothing."""
 
 
+@record
+class OfMeasurements(linearize.AtEstimate):
+    """A linearizer whose new landmarks are functions of measurements alone."""
+
+    def invert(self, z):
+        return z
+
+
 @refused(
     (lambda: Pair("near"), "Pair: first: expected a number, an array or a record .* got 'near'"),
     (lambda: Pair([1.0, 2.0]), "Pair: first: expected an array, as of numpy.asarray, got a list"),
@@ -138,6 +147,7 @@ class Still(World):
     (Bare, "Bare: expected @record above the class"),
     (lambda: Later(R), "Later: expected @record above the class"),
     (Still, "Still: draw: expected a method, got none"),
+    (OfMeasurements, r"OfMeasurements: invert: expected a method of \(sensor, z, tag, point\), got one of \(z\)"),
     told="^",
 )  # fmt: skip
 def test_bad_input_is_one_line_that_names_the_class(make):
@@ -153,6 +163,7 @@ class Checked:
     mount: object = field(default=None, check=or_none(finite(3)))
     rule: object = field(default=None, check=or_none(function_of("z", "tag")))
     kind: object = static(default="plain", check=one_of("plain", "robust"))
+    spread: object = field(default=0.0, check=not_negative)
 
     def __post_init__(self):
         if is_concrete(self.width) and self.count > self.width:  # numbers, by their checks
@@ -187,6 +198,9 @@ class Below(Checked):
         (lambda: Checked(2.0, rule=Pair), "Checked", "rule", "expected a function of (z, tag), got the class Pair: call it, Pair(…)"),
         (lambda: Checked(2.0, kind=R[0]), "Checked", "kind", "expected a value that is compared by ==, got an array"),
         (lambda: Checked(2.0, kind=0), "Checked", "kind", 'expected "plain" or "robust", got 0'),
+        (lambda: Checked(2.0, spread=-1), "Checked", "spread", "expected a finite number >= 0, got -1"),
+        (lambda: Checked(2.0, spread=np.inf), "Checked", "spread", "expected a finite number >= 0, got inf"),
+        (lambda: Checked(2.0, spread=R[0]), "Checked", "spread", "expected a finite number >= 0, got an array of shape (2,)"),
         (lambda: Checked(2.0, 3), "Checked", "", "expected count <= width"),
         (lambda: Below(-1.0), "Below", "width", "expected a number above 0, got -1.0"),
         (lambda: Below(extra=3), "Below", "extra", "expected no 3"),
@@ -205,7 +219,8 @@ def test_a_refusal_says_owner_field_and_reason(make, owner, name, reason):
 
 
 def test_a_check_converts_and_is_not_run_where_jax_rebuilds():
-    made = Checked(2.0, mount=[1, 2, 3], rule=lambda z, tag: z)
+    made = Checked(2.0, mount=[1, 2, 3], rule=lambda z, tag: z, spread=1)
+    assert type(made.spread) is int
     assert made.mount.dtype == np.float64 and is_record(made.rule) and made.rule(1, 2) == 1
     again = dataclasses.replace(made, width=3.0)
     assert again.mount is made.mount and again.rule is made.rule

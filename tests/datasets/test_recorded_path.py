@@ -192,6 +192,14 @@ HEAD = "time,x,y,theta\n"
         "t,x,y,theta [deg],c_xx,c_xy,c_xt,c_yy,c_yt,c_tt\n1,0,0,0,1,0,0,1,0,1\n",
         r"a.csv:1: expected theta \[rad\]",
     ),
+    (
+        "a.csv",
+        HEAD
+        + "".join(
+            f"{k},{5 * np.sin(k / 5)},{-5 * np.cos(k / 5)},{36 / np.pi * k}\n" for k in range(30)
+        ),
+        "a.csv:1: expected theta in radians, but it fits the positions in degrees: write theta .deg",
+    ),
     ("a.tum", "# t x y\n1 0 0 0 0 0 0\n", "a.tum:2: expected 8 fields"),
     ("a.tum", "1 0 0 0 0 0 0 2\n", "a.tum:1: expected a quaternion of norm 1"),
     ("a.tum", "2 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", "a.tum:2: expected a time above 2.0, got 1.0"),

@@ -19,7 +19,7 @@ AFTER = r"(?:[\s\d.,;±–\[\]()-]|\b(?:to|and|or)\b)*" + UNIT
 """a unit, after other numbers that it is of"""
 CITED = r"--record --only (\w+)"
 GIVEN = {
-    "docs/background/limits.md": {"3.11", "3.13", "0.10"},  # versions of Python and jaxlib
+    "docs/background/limits.md": {"0.10"},  # a version of jaxlib
     "docs/guide/animation.md": {"100"},  # frames
     "docs/guide/beyond_one_machine.md": {"3.13", "2026.8", "4.1", "22.05"},  # versions
     "docs/guide/campaigns.md": {

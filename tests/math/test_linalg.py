@@ -303,25 +303,25 @@ def test_a_matrix_is_singular_regular_or_indefinite_in_any_unit(n, dtype):
         clear = values[:, 0] > 1e-3 if rank == n else np.ones(len(s), bool)
         assert clear.sum() > 60
         s, values, vectors, unit = s[clear], values[clear], vectors[clear], unit[clear]
-        assert not definite.indefinite(s).any() and not definite.asymmetric(s).any()
-        assert (definite.invertible(s) == (rank == n)).all()
+        assert not definite.is_indefinite(s).any() and not definite.is_asymmetric(s).any()
+        assert (definite.is_invertible(s) == (rank == n)).all()
         values[:, 0] = -1e-2 if dtype == np.float32 else -1e-6
         other = np.einsum("cij,cj,ckj->cik", vectors, values, vectors)
         other = (other * unit[:, :, None] * unit[:, None, :]).astype(dtype)
         other = (other + other.transpose(0, 2, 1)) / 2
-        assert definite.indefinite(other).all() and not definite.invertible(other).any()
+        assert definite.is_indefinite(other).all() and not definite.is_invertible(other).any()
         turned = s.copy()
         turned[:, 0, 1] += np.asarray(1e-2 * unit[:, 0] * unit[:, 1], dtype)
-        assert definite.asymmetric(turned, 1e-6).all()
+        assert definite.is_asymmetric(turned, 1e-6).all()
 
 
 def test_a_variance_of_rounding_is_zero_and_a_negative_one_is_not():
     near = np.diag([4.0, -1e-16])
     near[0, 1] = near[1, 0] = 3e-16
-    assert not definite.indefinite(near) and not definite.invertible(near)
+    assert not definite.is_indefinite(near) and not definite.is_invertible(near)
     validation.require("thing", near, validation.covariance(2))
-    assert definite.indefinite(np.diag([4.0, -1e-12]))
-    assert not definite.indefinite(np.zeros((2, 2)))
+    assert definite.is_indefinite(np.diag([4.0, -1e-12]))
+    assert not definite.is_indefinite(np.zeros((2, 2)))
     # Metres beside radians: an indefinite part hides behind no large entry.
     mixed = np.diag([1e6, 1e-4, 1e-4])
     mixed[1, 2] = mixed[2, 1] = 2e-4

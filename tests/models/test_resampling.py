@@ -16,7 +16,7 @@ from jaxslam.resampling import REGISTRY, Soft, StopGradient, _kld, _weights, kld
 WEIGHTS = np.array([0.02, 0.0, 0.35, 0.1, 0.03, 0.25, 0.05, 0.2])
 
 
-NORMALIZED = jax.jit(_weights.normalized)
+NORMALIZED = jax.jit(_weights.normalize)
 
 
 @cache
@@ -121,7 +121,7 @@ def test_normalized_weights_against_plain_arithmetic():
 
 def test_gradients_of_the_weights_are_finite():
     """Also where some or all weigh nothing."""
-    slope_of = jax.jit(jax.grad(lambda x: _weights.normalized(x)[1] + _weights.effective_size(x)))
+    slope_of = jax.jit(jax.grad(lambda x: _weights.normalize(x)[1] + _weights.effective_size(x)))
     for log_weights in ([0.0, -np.inf, -3.0], [-np.inf] * 3, [0.0, np.nan, -1e308]):
         slope = slope_of(np.array(log_weights))
         assert np.all(np.isfinite(slope))
@@ -165,7 +165,7 @@ def estimated(a, key, method, count):
         key_noise, key_resample = jax.random.split(key)
         x = a * x + Q * jax.random.normal(key_noise, x.shape)
         fit = -0.5 * ((z - x) / R) ** 2 - math.log(R * math.sqrt(2 * math.pi))
-        weight, total, _ = _weights.normalized(log_w + fit)
+        weight, total, _ = _weights.normalize(log_w + fit)
         ancestor, log_w = _weights.survivors(method, weight, key_resample)
         return (x[ancestor], log_w), total
 
@@ -301,7 +301,7 @@ def test_headings_on_both_sides_of_the_seam_and_poses_far_away_have_bins():
     size = (1.0, 1.0, 2 * math.pi / 6)
     pose = np.array([[0, 0, np.pi], [0, 0, -np.pi], [1e300, -1e300, 0.0], [-0.5, 0.5, 0.0]])
     bins = np.asarray(jax.jit(partial(_kld.bins_of, size=size))(pose))
-    occupied = jax.jit(_kld.occupied)
+    occupied = jax.jit(_kld.count_distinct)
     np.testing.assert_array_equal(bins[:2], [[0, 0, 5], [0, 0, 0]])
     np.testing.assert_array_equal(bins[3], [-1, 0, 3])
     np.testing.assert_array_equal(occupied(bins), [1, 2, 3, 4])

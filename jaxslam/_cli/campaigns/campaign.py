@@ -7,7 +7,7 @@ import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, get_args
 
 import jax
 
@@ -49,10 +49,10 @@ def add_world_options(group: argparse._ArgumentGroup) -> None:
 
 
 def add_campaign_option(group: argparse._ArgumentGroup, name: str, text: str) -> None:
-    """Add an option of a campaign, a word or a number; it is absent from the options if left out,
-    so that those of a folder take its place."""
-    default = getattr(CampaignOptions(), name)
-    kind = str if isinstance(default, str) else int
+    """Add an option of a campaign, of the type of its field; it is absent from the options if left
+    out, so that those of a folder take its place."""
+    default, hint = getattr(CampaignOptions(), name), CampaignOptions.__annotations__[name]
+    kind = (*get_args(hint), hint)[0]  # T of T | None
     text += "" if default is None else f" (default: {default})"
     group.add_argument(f"--{name}", type=kind, default=argparse.SUPPRESS, help=text)
 

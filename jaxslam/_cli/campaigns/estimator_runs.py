@@ -1,7 +1,7 @@
 """Runs a program once for each run of a folder of draws, several at once."""
 
 import contextlib
-import json
+import hashlib
 import os
 import re
 import shlex
@@ -11,13 +11,20 @@ import subprocess
 import tempfile
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from pathlib import Path
 
 from jaxslam.consistency.campaign._progress import Progress
 from jaxslam.consistency.campaign._run_estimates import RunFault
-from jaxslam.datasets._judged_folders import PROGRAM, RUNS, TRAJECTORY, run_name
+from jaxslam.datasets._judged_folders import (
+    PROGRAM,
+    RUNS,
+    TRAJECTORY,
+    DrawsFolder,
+    origin_of,
+    run_name,
+)
 from jaxslam.datasets._lines import stored_file
 from jaxslam.results._files import check_writable, json_text
 
@@ -32,13 +39,17 @@ class Programs:
     """A program that is started once for each run of a folder of draws.
 
     What it writes for a run appears in the folder of estimates, as 0007, when the program has ended
-    with status 0: so a folder there is complete, and is not computed again.
+    with status 0: so a folder there is complete, and is not computed again. It notes the command,
+    the contents of the files that the command names, and those of the run.
     """
 
-    def __init__(self, command: str, draws: Path, estimates: Path, limit: float | None) -> None:
+    def __init__(
+        self, command: str, draws: DrawsFolder, estimates: Path, limit: float | None
+    ) -> None:
         self._command, self._draws, self._estimates = command, draws, estimates
         self._limit = limit
         self._words = _words_of(command)
+        self._files = _checksums(self._words)
         self._running: set[subprocess.Popen[bytes]] = set()
         self._lock = threading.Lock()
         self._stops = False
@@ -46,8 +57,9 @@ class Programs:
     def run(self, numbers: Sequence[int], workers: int) -> dict[int, RunFault]:
         """Compute the missing estimates of some runs; why there is none of the others, by number.
 
-        Raises ValueError where the folder holds estimates of another command, or the program cannot
-        be started, and KeyboardInterrupt on Ctrl-C, with what is finished in place.
+        Raises ValueError where the folder holds estimates of another command, of a program that
+        has changed since, or of other draws, or the program cannot be started, and
+        KeyboardInterrupt on Ctrl-C, with what is finished in place.
         """
         check_writable(self._estimates)
         missing = [number for number in numbers if not self._is_finished(number)]
@@ -64,8 +76,15 @@ class Programs:
                     if (fault := future.result()) is not None:
                         faults[futures[future]] = fault
                     progress(finished, len(missing))
-        except BaseException:
+        except BaseException as stop:
             self._stop()
+            if isinstance(stop, KeyboardInterrupt):
+                pool.shutdown(cancel_futures=True)
+                finished = sum(map(self._is_finished, numbers))
+                raise KeyboardInterrupt(
+                    f"{self._estimates} has {finished:,} of {len(numbers):,} runs; the same "
+                    "command goes on"
+                ) from None
             raise
         finally:
             pool.shutdown(cancel_futures=True)
@@ -75,17 +94,19 @@ class Programs:
         folder = self._estimates / run_name(number)
         if not folder.exists():
             return False
-        try:
-            command = json.loads((folder / PROGRAM).read_text(encoding="utf-8"))["command"]
-        except (OSError, ValueError, LookupError, TypeError):
-            command = None
-        if command != self._command:
-            origin = "no command" if command is None else f"the command {command!r}"
-            raise ValueError(
-                f"--estimator: {folder} holds an estimate of {origin}: choose another folder of "
-                "estimates, or remove this one"
-            )
-        return True
+        origin = origin_of(folder)
+        if (command := origin.get("command")) != self._command:
+            of = "no command" if command is None else f"the command {command!r}"
+        elif changed := _changed(origin.get("files"), self._files):
+            of = f"another {', '.join(changed)}, which changed since"
+        elif origin.get("log") != self._draws.log_checksum(folder.name):
+            of = f"other draws than {self._draws.path}"
+        else:
+            return True
+        raise ValueError(
+            f"--estimator: {folder} holds an estimate of {of}: choose another folder of "
+            "estimates, or remove this one"
+        )
 
     def _run_once(self, number: int) -> RunFault | None:
         """Run the program for one run; why there is no estimate, if there is none."""
@@ -93,32 +114,37 @@ class Programs:
         with tempfile.TemporaryDirectory(dir=self._estimates, prefix=".unfinished-") as hidden:
             estimate, said = Path(hidden).absolute() / name, Path(hidden) / "said"
             estimate.mkdir()
-            places = ((self._draws / RUNS / name).absolute(), estimate)
+            places = ((self._draws.path / RUNS / name).absolute(), estimate)
             words = [_with_places(word, places) for word in self._words]
             began = time.perf_counter()
-            with said.open("wb") as file, self._started(words, file.fileno()) as process:
+            with said.open("wb") as file, self._start(words, file.fileno()) as process:
                 try:
                     status = process.wait(self._limit)
                 except subprocess.TimeoutExpired:
                     status = None
                     _kill(process)
             seconds = time.perf_counter() - began
-            text = said.read_bytes().decode("utf-8", "replace").strip()[-_SHOWN:]
+            text = _end_of(said)
             if status is None:
                 assert self._limit is not None
-                return RunFault(f"over the time limit of {self._limit:g} s", "killed", text)
+                return RunFault(f"over the time limit of {self._limit:g} s", "", text)
             if status != 0:
                 how = f"exit status {status}" if status > 0 else f"killed by signal {-status}"
                 return RunFault(how, text.splitlines()[-1] if text else "", text)
             if stored_file(estimate / TRAJECTORY) is None:
                 return RunFault(f"wrote no {TRAJECTORY}", "exit status 0", text)
-            note = {"command": self._command, "seconds": seconds}
+            note = {
+                "command": self._command,
+                "files": self._files,
+                "log": self._draws.log_checksum(name),
+                "seconds": seconds,
+            }
             (estimate / PROGRAM).write_text(json_text(note), encoding="utf-8")
             os.replace(estimate, self._estimates / name)
         return None
 
     @contextlib.contextmanager
-    def _started(self, words: Sequence[str], said: int) -> Iterator[subprocess.Popen[bytes]]:
+    def _start(self, words: Sequence[str], said: int) -> Iterator[subprocess.Popen[bytes]]:
         """A program that writes to the file `said`; it has ended when the context is left."""
         with self._lock:  # none is started once all are stopped
             if self._stops:
@@ -175,6 +201,29 @@ def _words_of(command: str) -> list[str]:
     if shutil.which(words[0]) is None:
         raise ValueError(f"--estimator: {words[0]}: there is no such program")
     return words
+
+
+def _checksums(words: Sequence[str]) -> dict[str, str]:
+    """The SHA-256 of each file that a command names, as its program or a script of it."""
+    checksums = {}
+    for word, path in {words[0]: shutil.which(words[0]) or "", **{w: w for w in words[1:]}}.items():
+        if Path(path).is_file():
+            with open(path, "rb") as file:
+                checksums[word] = hashlib.file_digest(file, "sha256").hexdigest()
+    return checksums
+
+
+def _changed(earlier: object, files: Mapping[str, str]) -> list[str]:
+    """The files whose checksum is not the earlier one."""
+    known = earlier if isinstance(earlier, dict) else {}
+    return [name for name, checksum in files.items() if known.get(name) != checksum]
+
+
+def _end_of(said: Path) -> str:
+    """The last characters of what a program wrote."""
+    with said.open("rb") as file:
+        file.seek(max(said.stat().st_size - 4 * _SHOWN, 0))  # 4 bytes a character at most
+        return file.read().decode("utf-8", "replace").strip()[-_SHOWN:]
 
 
 def _with_places(word: str, places: tuple[Path, Path]) -> str:

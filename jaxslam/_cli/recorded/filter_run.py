@@ -17,7 +17,7 @@ from jaxslam.core.types import Log, Status
 from jaxslam.datasets import Dataset
 from jaxslam.datasets._evaluation import Evaluation, evaluate, joint_map_cov
 from jaxslam.datasets._uncertain_constants import consider_constants
-from jaxslam.math._definite import indefinite
+from jaxslam.math._definite import is_indefinite
 from jaxslam.results._files import Json
 
 MAX_NIS_PER_DOF, MAX_NEES_RATIO = 30.0, 100.0
@@ -117,7 +117,7 @@ def on_true_poses(data: Dataset) -> tuple[Log, int]:
 
 def is_positive_definite(cov: Float[np.ndarray, "D D"]) -> bool:
     """Whether a covariance is finite and has no negative eigenvalue; 0 may be one."""
-    return bool(np.isfinite(cov).all()) and not indefinite(cov)
+    return bool(np.isfinite(cov).all()) and not is_indefinite(cov)
 
 
 def _summary(result: PiecewiseRun, unplaced: int, constants: str, seconds: float) -> Json:

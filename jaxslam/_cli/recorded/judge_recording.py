@@ -16,6 +16,13 @@ from jaxslam.results._files import Files, Json, csv_text, json_number, json_text
 
 DRAWING = "errors"
 
+OPTIONS: dict[str, tuple[str, object]] = {
+    "--align": ("align", "none"),
+    "--covariance-frame": ("covariance_frame", "world"),
+    "--gap": ("gap", None),
+}
+"""Field and default of each option of a recording besides its two sources."""
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options for a recording, without those of folder and figures."""
@@ -92,7 +99,7 @@ def run(options: argparse.Namespace, command: str = "jaxslam judge") -> int:
 
 
 def source_notes(align: str, estimate: RecordedPath, truth: RecordedPath) -> list[str]:
-    """What was left out of the two sources, what the readers assumed, and frames that differ."""
+    """Notes on the two sources: rows left out, assumptions of the readers, frames that differ."""
     notes = []
     for path in (estimate, truth):
         notes += [f"{path.source}: {note}" for note in path.notes]

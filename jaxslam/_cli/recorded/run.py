@@ -180,7 +180,7 @@ def print_summary(summary: Json, runs: Mapping[str, FilterRun]) -> None:
         return
     of_data = {key: value for key, value in summary.items() if key != "filters"}
     print(summary_table({"": of_data}), end="\n\n")
-    print(summary_table({name: _flat(run.summary) for name, run in runs.items()}))
+    print(summary_table({name: _flatten(run.summary) for name, run in runs.items()}))
     for name, run in runs.items():
         if notes := run.summary.get("notes"):
             print(summary_table({"": {name: notes}}))
@@ -218,7 +218,7 @@ def write_runs(
     return write_results(folder, files, drawings, FILMS)
 
 
-def _flat(summary: Json) -> Json:
+def _flatten(summary: Json) -> Json:
     """The summary as rows of one value: one per status that occurs, one per coordinate."""
     status, final = summary["status"], summary["final pose"]
     assert isinstance(status, dict)
@@ -276,8 +276,8 @@ def _true_path(data: Dataset, evaluation: Evaluation) -> Float[np.ndarray, "T 3"
 
 def _films(data: Dataset, runs: Mapping[str, FilterRun]) -> Files:
     """The film of each filter, by file name; see `film_files`."""
-    from jaxslam.results import plot  # matplotlib is slow to load
-    from jaxslam.results.plot._run_film import History, frame_steps, run_scene
+    # Matplotlib is slow to load.
+    from jaxslam.results.plot._run_film import History, frame_steps, run_film
 
     films = {}
     for name, (result, evaluation, _) in runs.items():
@@ -291,11 +291,10 @@ def _films(data: Dataset, runs: Mapping[str, FilterRun]) -> Files:
             slot=result.slot,
             seen=result.watched,
         )
-        scene = run_scene(
+        films[name] = run_film(
             history,
             true_points=evaluation.points,
             true_path=_true_path(data, evaluation),
             title=f"{data.name}: {name}",
         )
-        films[name] = plot.Film(scene)
     return film_files(films, suffixed=len(films) > 1)

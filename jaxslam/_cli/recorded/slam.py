@@ -184,8 +184,7 @@ def figures(
 
 def film(log: LaserLog, solved: Solved, settings: Settings) -> "Film":
     """The film of a map that grows by laser odometry alone, and of the map after closing."""
-    from jaxslam.results import plot  # matplotlib is slow to load
-    from jaxslam.results.plot._grid_figures import map_scene
+    from jaxslam.results.plot._grid_figures import map_film  # matplotlib is slow to load
 
     maps, until = growing_maps(log, solved.odometry, settings, others=[solved.poses])
     closed, _ = growing_maps(log, solved.poses, settings, others=[solved.odometry])
@@ -194,7 +193,7 @@ def film(log: LaserLog, solved: Solved, settings: Settings) -> "Film":
     paths = [solved.odometry[:end] for end in until] + [solved.poses] * FINAL_FRAMES
     captions = [f"laser odometry, scan {end:,} of {until[-1]:,}" for end in until]
     captions += [f"after closing by {kept:,} loops"] * FINAL_FRAMES
-    scene = map_scene(
+    return map_film(
         [np.asarray(grid.log_odds) for grid in (*maps, *last)],
         np.asarray(maps[0].origin),
         float(maps[0].resolution),
@@ -202,7 +201,6 @@ def film(log: LaserLog, solved: Solved, settings: Settings) -> "Film":
         captions,
         title=log.name,
     )
-    return plot.Film(scene)
 
 
 def result_summary(solved: Solved) -> dict[str, object]:

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 
 from jaxslam.consistency._measures.measure import Measure, Runs, RunScores, Sums, ratio
 from jaxslam.consistency._measures.nees import DOF
-from jaxslam.math._definite import invertible
+from jaxslam.math._definite import is_invertible
 from jaxslam.math.stats import chi2_quantile
 
 LEVELS = tuple(np.round(np.arange(0.05, 0.96, 0.05), 2).tolist()) + (0.99,)
@@ -17,7 +17,7 @@ LEVELS = tuple(np.round(np.arange(0.05, 0.96, 0.05), 2).tolist()) + (0.99,)
 
 @dataclass(frozen=True, eq=False)
 class Credibility(Measure):
-    """One of the two numbers of `credibility`."""
+    """The noncredibility or the inclination of a filter, by `credibility`."""
 
     part: int = 0
 
@@ -122,7 +122,7 @@ def credibility(
             continue
         e = errors[runs, step]
         actual = e.T @ e / len(runs)
-        if not invertible(actual):
+        if not is_invertible(actual):
             continue
         claimed = np.einsum("ri,ri->r", e, np.linalg.solve(covs[runs, step], e[:, :, None])[..., 0])
         fair = np.einsum("ri,ri->r", e, np.linalg.solve(actual, e.T).T)

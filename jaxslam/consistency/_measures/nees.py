@@ -30,7 +30,7 @@ class NeesMeasure(Measure):
     block: str = ""
 
     def of_runs(self, runs: Runs) -> RunScores:
-        """Its sum over the steps with a regular covariance."""
+        """The sum of the NEES over the steps with a regular covariance."""
         value, regular = runs.nees[self.block]
         sums = {self.key: value, f"regular_{self.block}": regular.astype(np.float64)}
         return RunScores(value.sum(axis=1), regular.sum(axis=1), sums if self.block in DOF else {})

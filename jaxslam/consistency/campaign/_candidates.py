@@ -18,7 +18,7 @@ from jaxslam.core.protocols import Candidate, Estimator, Filter, Motion, Sensor
 from jaxslam.core.types import Truth
 from jaxslam.core.validation import Check, InvalidField, covariance, instance_of, require
 from jaxslam.graphs.smoothing._forward_pass import LogEstimator
-from jaxslam.math._definite import invertible
+from jaxslam.math._definite import is_invertible
 from jaxslam.sensors._suite import Suite
 from jaxslam.simulation._worlds import World
 
@@ -80,7 +80,7 @@ def without_noise(scenario: World) -> str:
             cov, names = np.asarray(_noise_cov(model, z)), model.measurements
             sigma = np.sqrt(np.diagonal(cov))
             exact = ", ".join(n for n, s in zip(names, sigma, strict=True) if s == 0)
-            if not exact and not invertible(cov):
+            if not exact and not is_invertible(cov):
                 exact = f"a combination of {', '.join(names)}"
             if not exact:
                 break

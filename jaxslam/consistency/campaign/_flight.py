@@ -83,7 +83,7 @@ class Flight:
                 with contextlib.suppress(AttributeError):  # not every engine has it
                     future.cancel()
 
-    def finished(self) -> Iterator[tuple[Piece, BlockResult | BaseException]]:
+    def collect(self) -> Iterator[tuple[Piece, BlockResult | BaseException]]:
         """The results of the blocks that have ended since, or the error of one that failed.
 
         Waits until a block ends, for a second at most.

@@ -137,7 +137,7 @@ def monte_carlo(
             # runs a second of one block at a time on an H100, and no more with three.
             workers = -(-cores() // len(devices)) if devices[0].platform == "cpu" else 2
         size = int(block or fitting_block(scenario, filters, devices[0]))
-        near, near_filters, origin = near_the_origin(scenario, filters)
+        near, near_filters, origin = move_to_start(scenario, filters)
         plan = CampaignPlan(near, near_filters, key, devices, size, bound, dtype)
         if part is not None and (part[0] - 1) * plan.wide >= runs:
             raise InvalidField(
@@ -283,7 +283,7 @@ def sum_up(
     )
 
 
-def near_the_origin(
+def move_to_start(
     scenario: World, filters: Mapping[str, Candidate]
 ) -> tuple[World, Mapping[str, Candidate], np.ndarray | None]:
     """World and filters with positions relative to the start, and the start's (x, y) in the map.

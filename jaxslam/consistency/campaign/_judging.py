@@ -18,7 +18,7 @@ from jaxslam.consistency._tally import Tally, condense
 from jaxslam.consistency.campaign._block import BOUND, BlockRunner, CampaignPlan, rows_of_truth
 from jaxslam.consistency.campaign._block_programs import fitting_block
 from jaxslam.consistency.campaign._candidates import candidate_for, check_noise
-from jaxslam.consistency.campaign._harness import near_the_origin, sum_up
+from jaxslam.consistency.campaign._harness import move_to_start, sum_up
 from jaxslam.consistency.campaign._pieces import missing_pieces
 from jaxslam.consistency.campaign._progress import Progress
 from jaxslam.consistency.campaign._result import Campaign
@@ -26,6 +26,7 @@ from jaxslam.consistency.campaign._run_estimates import (
     NOT_FINITE,
     RunEstimate,
     RunFault,
+    RunShape,
     as_estimate,
     estimate_of_run,
     score_estimates,
@@ -55,7 +56,7 @@ _FAULTS_OF_COV = {"asymmetric_steps": "not symmetric", "indefinite_steps": "not 
 
 
 class Outcome(NamedTuple):
-    """What an estimator makes of one run."""
+    """The result of an estimator on one run."""
 
     truth: Truth
     """what its estimate is compared with"""
@@ -172,7 +173,7 @@ def judge_sources(
         began, runs = time.perf_counter(), int(runs)
         devices = jax.local_devices() if devices is None else list(devices)
         size = int(block or (fitting_block(world, filters, devices[0]) if filters else 16))
-        near, near_filters, origin = near_the_origin(world, filters)
+        near, near_filters, origin = move_to_start(world, filters)
         plan = CampaignPlan(near, near_filters, key, devices, size, bound, None, stride)
         pieces = missing_pieces([], runs, plan.wide)
         judged = _judge_pieces(plan, sources, pieces, origin, progress)
@@ -191,7 +192,7 @@ def judge_sources(
             name: judged[name].qualify(summary, pieces) if name in judged else summary
             for name, summary in campaign.filters.items()
         }
-        notes = [note for name, estimator in judged.items() for note in estimator.notes(name)]
+        notes = [note for estimator in judged.values() for note in estimator.notes()]
         if stride > 1:
             notes.insert(
                 0, f"judged at {campaign.steps:,} of {world.steps:,} steps, one in {stride}."
@@ -208,21 +209,48 @@ def judge_sources(
 class _Judgement:
     """The scores of an estimator from elsewhere, and what is wrong with its runs."""
 
-    def __init__(self) -> None:
+    def __init__(self, name: str, source: Source, plan: CampaignPlan) -> None:
+        self.name, self.source, self.plan = name, source, plan
         self.scores: list[Score] = []
         self.faults: dict[int, RunFault] = {}
         self.seconds: list[float] = []
         self.first: tuple[Truth, Estimate] | None = None
         self.has_final_maps = False
 
-    def add(self, number: int, outcome: Outcome) -> None:
-        """Note what is wrong with a run, and its wall time."""
+    def judge_run(self, number: int, truth: Truth, log: Log, shape: RunShape) -> Outcome:
+        """The outcome of a run: its estimate at the judged steps, or what is wrong with it."""
+        copied = jax.tree.map(np.copy, log)  # the estimator may write into it
+        outcome = self.source(number, truth, copied)
+        if outcome.fault is None and outcome.estimate is not None:
+            with refusals_of(f"{self.name}, run {number}"):
+                estimate, fault = select_rows(outcome.estimate, outcome.truth, shape)
+            outcome = outcome._replace(estimate=None if fault else estimate, fault=fault)
         if outcome.fault is not None:
             self.faults[number] = outcome.fault
         if outcome.seconds is not None:
             self.seconds.append(outcome.seconds)
         if outcome.estimate is not None and outcome.estimate.maps is not None:
-            self.has_final_maps |= outcome.estimate.maps[2].ndim == 1
+            tags = outcome.estimate.maps[2]
+            self.has_final_maps |= tags.ndim == 1 and bool((tags >= 0).any())
+        if number == 0 and outcome.estimate is not None:
+            stride = self.plan.stride
+            run_0 = with_positions(self.plan.scenario.sensor, outcome.truth)
+            run_0 = rows_of_truth(run_0, slice(stride - 1, None, stride))
+            self.first = run_0, estimate_of_run(outcome.estimate, shape)
+        return outcome
+
+    def score_piece(self, outcomes: Sequence[Outcome], shape: RunShape) -> None:
+        """Add the scores of successive runs."""
+        truths = [outcome.truth for outcome in outcomes]
+        scores = score_estimates(
+            [outcome.estimate for outcome in outcomes],
+            jax.tree.map(lambda *leaves: np.stack(leaves), *truths),
+            shape,
+            self.plan.scenario.sensor,
+            self.plan.devices[0],
+            self.plan.wide,
+        )
+        self.scores.append(scores)
 
     def qualify(self, summary: Summary, pieces: Sequence[tuple[int, int]]) -> Summary:
         """The summary with the reasons for which runs are not judged, and with the numbers of the
@@ -250,22 +278,26 @@ class _Judgement:
         """The sentence on runs that are not judged."""
         parts = []
         for reason, numbers in by_reason.items():
-            details = [f"run {n}: {self.faults[n].detail}" for n in numbers if n in self.faults]
+            found = [(n, self.faults[n].detail) for n in numbers if n in self.faults]
+            details = [f"run {n}: {detail}" for n, detail in found if detail]
             listed = "; ".join(details[:_LISTED]) + "; …" * (len(details) > _LISTED)
             parts.append(f"{len(numbers):,} {reason}" + f" ({listed})" * bool(listed))
         lost = sum(map(len, by_reason.values()))
         averages = f"averages of the {rest:,} judged runs" if rest else "there are no averages"
-        return f"{lost:,} of {lost + rest:,} runs are not judged: {', '.join(parts)}: {averages}"
+        verb = "is" if lost == 1 else "are"
+        return f"{lost:,} of {lost + rest:,} runs {verb} not judged: {', '.join(parts)}: {averages}"
 
-    def notes(self, name: str) -> list[str]:
-        """Texts below the table."""
+    def notes(self) -> list[str]:
+        """The texts below the table."""
         notes = []
         for number, fault in self.faults.items():
             if fault.text:
-                notes.append(f"{name}, run {number}, the first that failed:\n{fault.text}")
+                notes.append(f"{self.name}, run {number}, the first that failed:\n{fault.text}")
                 break
         if self.has_final_maps:
-            notes.append(f"{name}: the landmark NEES is of its final maps, without steps before.")
+            notes.append(
+                f"{self.name}: the landmark NEES is of its final maps, without steps before."
+            )
         return notes
 
 
@@ -277,8 +309,8 @@ def _judge_pieces(
     progress: Callable[[int, int], None] | Literal[False] | None,
 ) -> dict[str, _Judgement]:
     """The scores of each estimator in pieces (first, runs) of a campaign."""
-    runner, judged = BlockRunner(plan), {name: _Judgement() for name in sources}
-    world, device = plan.scenario, plan.devices[0]
+    runner, world = BlockRunner(plan), plan.scenario
+    judged = {name: _Judgement(name, source, plan) for name, source in sources.items()}
     runs = sum(count for _, count in pieces)
     title = f"{world.name}, {', '.join(sources)}"
     with Progress(title) if progress is None else contextlib.nullcontext(progress or None) as bar:
@@ -291,42 +323,12 @@ def _judge_pieces(
                 truth, log = jax.tree.map(lambda leaf, i=i: leaf[i], (truths, logs))
                 truth = truth if origin is None else to_map_coordinates(truth, origin)
                 shape = shape_of(log, truth, plan.stride)
-                for name, source in sources.items():
-                    copied = jax.tree.map(np.copy, log)  # the estimator may write into it
-                    outcome = source(first + i, truth, copied)
-                    estimate, fault = outcome.estimate, outcome.fault
-                    if estimate is not None and fault is None:
-                        with refusals_of(f"{name}, run {first + i}"):
-                            estimate, fault = select_rows(estimate, outcome.truth, shape)
-                        outcome = outcome._replace(
-                            estimate=None if fault else estimate, fault=fault
-                        )
-                    judged[name].add(first + i, outcome)
-                    outcomes[name].append(outcome)
-                    if first + i == 0 and outcome.estimate is not None:
-                        judged[name].first = (
-                            rows_of_truth(
-                                with_positions(world.sensor, outcome.truth),
-                                slice(plan.stride - 1, None, plan.stride),
-                            ),
-                            estimate_of_run(outcome.estimate, shape),
-                        )
+                for name, judgement in judged.items():
+                    outcomes[name].append(judgement.judge_run(first + i, truth, log, shape))
                 if bar is not None:
                     bar(first + i + 1, runs)
-            for name, results in outcomes.items():
-                of_runs = jax.tree.map(
-                    lambda *leaves: np.stack(leaves), *(outcome.truth for outcome in results)
-                )
-                judged[name].scores.append(
-                    score_estimates(
-                        [outcome.estimate for outcome in results],
-                        of_runs,
-                        shape,
-                        world.sensor,
-                        device,
-                        plan.wide,
-                    )
-                )
+            for name, judgement in judged.items():
+                judgement.score_piece(outcomes[name], shape)
     return judged
 
 

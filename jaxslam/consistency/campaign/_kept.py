@@ -9,7 +9,7 @@ from jaxslam.consistency._tally import Tally
 
 
 class Keep(Protocol):
-    """Where finished blocks are kept: `jaxslam.store.open` gives one. Claimed before it is read."""
+    """The store of finished blocks, as of `jaxslam.store.open`. Claimed before it is read."""
 
     def claim(self, identity: Mapping[str, str]) -> None:
         """Note what campaign this is, once; ValueError where it is another that was noted."""

@@ -28,7 +28,7 @@ _SETTINGS = (
 
 
 class Executor(Protocol):
-    """What computes blocks elsewhere: any object with the `submit` of `concurrent.futures`.
+    """An engine that computes blocks elsewhere: any with the `submit` of `concurrent.futures`.
 
     What `submit` returns needs `done`, `exception` and `result`.
     """

@@ -134,7 +134,10 @@ def as_estimate(value: object) -> RunEstimate:
 def _array(field: str, value: object, shape: tuple[int | str, ...]) -> np.ndarray:
     """An array of this shape, in which a letter is any number, in float64."""
     try:
-        array = np.asarray(value, np.float64)
+        array = np.asarray(value)
+        if array.dtype.kind == "c":  # NumPy would drop the imaginary part, with a warning
+            raise TypeError
+        array = array.astype(np.float64)
     except (TypeError, ValueError):
         raise InvalidField(field, f"expected real numbers, got {value!r:.60}") from None
     if array.ndim != len(shape) or any(
@@ -365,7 +368,8 @@ def score_estimates(
     )
     measured = (info.status != Status.EMPTY).sum(axis=(1, 2))
     truth = truth._replace(missed=np.zeros((runs, shape.steps), int))
-    scores = score(*select_steps(stride, trace, truth, statistics, None, measured))
+    with np.errstate(over="ignore", invalid="ignore"):  # of 1e200 m: the run is not finite then
+        scores = score(*select_steps(stride, trace, truth, statistics, None, measured))
     # Neither the coordinates of its error nor the measurements that it did not use are known.
     measures = {name: value for name, value in scores.measures.items() if name != "nees_own"}
     sums = dict(scores.sums)

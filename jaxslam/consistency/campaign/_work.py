@@ -103,7 +103,7 @@ class Work:
             try:
                 while queue and stop is None and len(flight) <= self.workers:
                     flight.start(queue.pop())
-                for (first, count), result in flight.finished():
+                for (first, count), result in flight.collect():
                     if stop is not None and isinstance(result, BaseException):
                         continue
                     if isinstance(result, BaseException):

@@ -77,7 +77,7 @@ def transform(frame: ArrayLike, rows: ArrayLike) -> Float[np.ndarray, "K n"]:
 def pose_pair(
     reference: ArrayLike, estimate: ArrayLike
 ) -> tuple[Float[np.ndarray, "K 3"], Float[np.ndarray, "K 3"]]:
-    """Both as finite tables (K, 3) in float64; raises InvalidField on others."""
+    """Reference and estimate as finite tables (K, 3) in float64; InvalidField on others."""
     true, path = poses_of("reference", reference), poses_of("estimate", estimate)
     _check_lengths(true, path)
     return true, path

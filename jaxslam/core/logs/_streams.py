@@ -160,7 +160,7 @@ GAP_FACTOR = 10
 
 
 def is_gap(clock: Float[np.ndarray, "K"], longest: float | None = None) -> Bool[np.ndarray, "_"]:
-    """Which intervals between K lines are longer than `longest` [s], (K - 1,).
+    """Mask (K - 1,) of the intervals between K lines that are longer than `longest` [s].
 
     Default: `GAP_FACTOR` times their median, above the rounding of stamps of ten digits.
     """
@@ -175,7 +175,7 @@ def between_lines(
     rows: Float[np.ndarray, "T"],
     joined: Bool[np.ndarray, "_"],
 ) -> Bool[np.ndarray, "T"]:
-    """Which rows have the time of a line, or are between two lines that are joined (K - 1,)."""
+    """Mask of the rows at the time of a line, or between two lines that are joined (K - 1,)."""
     after = np.searchsorted(clock, rows)
     last = len(clock) - 1
     within = np.concatenate([[False], joined, [False]])[after]
@@ -209,8 +209,8 @@ def known_poses(
 def true_path_faults(
     clock: Float[np.ndarray, "K"], pose: Float[np.ndarray, "K 3"]
 ) -> tuple[Bool[np.ndarray, "K"], Bool[np.ndarray, "K"]]:
-    """Which finite lines of a true path are reached by a jump, and which a tracker wrote that had
-    lost the robot (`lost_lines`)."""
+    """Masks of the finite lines of a true path that a jump leads to, and of those that a tracker
+    wrote when it had lost the robot (`lost_lines`)."""
     finite = np.isfinite(pose).all(axis=1)
     jump, lost = np.zeros((2, len(clock)), bool)
     jump[finite] = odometry_jumps(pose[finite], clock[finite])

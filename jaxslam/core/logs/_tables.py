@@ -153,8 +153,9 @@ def align_tables(
         for name, kept in zip(seen.table.tags or (), inside, strict=False)
         if kept
     }
-    tag_of = {name: tag for tag, name in enumerate(ordered({*names, *named}))}
+    tag_of = {name: tag for tag, name in enumerate(sort_names({*names, *named}))}
     tags = [_tags_in_scans(seen, tag_of) for seen in sensors]
+    # Those in a gap are outside of `within`, too, but have a count of their own.
     kept, outside, negative, beyond, soon = [], -in_gap, 0, 0, 0
     for seen, tag, inside in zip(sensors, tags, within, strict=True):
         when = seen.table.columns[TIME]
@@ -170,7 +171,7 @@ def align_tables(
         no_echo = inside & (values[:, ranges] < 0).any(axis=1)
         far = inside & (values[:, ranges] >= seen.max_range).any(axis=1)
         used = inside & ~no_echo & ~far
-        early = used & _too_soon(seen, tag, used)
+        early = used & _is_too_soon(seen, tag, used)
         used &= ~early
         kept.append((when[used], tag[used], values[used]))
         outside += int((~inside).sum())
@@ -180,7 +181,7 @@ def align_tables(
     times = np.unique(np.concatenate([clock, *(when for when, *_ in kept)]))
     moved = clock, odometry.values(columns)
     places = [seen.places for seen in sensors]
-    rows = _side_by_side(
+    rows = _join_slots(
         [streams.align_streams(moved, stream, rule, times) for stream in kept], places
     )
     if INTERVAL in controls and rule is not streams.hold:
@@ -223,10 +224,10 @@ def _tags_in_scans(seen: Seen[_Name], tag_of: dict[_Name, int]) -> Int[np.ndarra
     return np.array(tags, np.int64)
 
 
-def _too_soon(
+def _is_too_soon(
     seen: Seen[_Name], tag: Int[np.ndarray, "J"], used: Bool[np.ndarray, "J"]
 ) -> Bool[np.ndarray, "J"]:
-    """Which measurements come sooner after one of the same landmark than the spacing."""
+    """Mask of the measurements sooner after one of the same landmark than the spacing."""
     too_soon = np.zeros(len(tag), bool)
     if not seen.spacing:
         return too_soon
@@ -243,12 +244,12 @@ def _too_soon(
     return too_soon
 
 
-def _side_by_side(scans: Sequence[streams.Rows], places: Sequence[int | None]) -> streams.Rows:
+def _join_slots(scans: Sequence[streams.Rows], places: Sequence[int | None]) -> streams.Rows:
     """Rows at the same times with the slots of several sensors, each padded to its places, and z to
     the longest."""
     size = max(rows.z.shape[2] for rows in scans)
 
-    def padded(rows: streams.Rows, count: int | None) -> streams.Rows:
+    def pad(rows: streams.Rows, count: int | None) -> streams.Rows:
         spare = 0 if count is None else count - rows.tag.shape[1]
         slots = (0, 0), (0, spare)
         return rows._replace(
@@ -257,7 +258,7 @@ def _side_by_side(scans: Sequence[streams.Rows], places: Sequence[int | None]) -
             valid=np.pad(rows.valid, slots),
         )
 
-    blocks = [padded(*pair) for pair in zip(scans, places, strict=True)]
+    blocks = [pad(*pair) for pair in zip(scans, places, strict=True)]
     z, tag, valid = (
         np.concatenate([getattr(rows, name) for rows in blocks], axis=1)
         for name in ("z", "tag", "valid")
@@ -332,7 +333,7 @@ def replace_jumps(odometry: Columns[_Name]) -> str:
     )
 
 
-def ordered(names: set[_Name | None]) -> list[_Name]:
+def sort_names(names: set[_Name | None]) -> list[_Name]:
     """The names of landmarks, whole numbers before text; None, the unknown one, is left out."""
     named = (name for name in names if name is not None)
     return sorted(named, key=lambda name: (isinstance(name, str), name))
@@ -353,7 +354,7 @@ def columns_of(
         ValueError: on a column that is missing, in another unit, of another length, or with a value
             that is not a finite number.
     """
-    table = _held(table)
+    table = _to_numpy(table)
     names = _names(table)
     needed = list(wanted(names or ()))
 
@@ -364,7 +365,7 @@ def columns_of(
         without_axes = isinstance(table, np.ndarray) and table.ndim == 0
         if without_axes or not isinstance(table, Sequence | np.ndarray):
             raise InvalidField(argument, f"expected rows or columns, got {type(table).__name__}")
-        rows = [_held(row) for row in table]
+        rows = [_to_numpy(row) for row in table]
         for k, row in enumerate(rows):
             size = len(row) if isinstance(row, Sequence) or np.ndim(row) else 1
             if size != len(needed) or isinstance(row, str):
@@ -383,7 +384,7 @@ def columns_of(
             divisor = unit_divisor(split_unit(header[bare])[1], name)
             if divisor is None:
                 raise InvalidField(argument, f"expected the column {name!r}, got {header[bare]!r}")
-            column = _held(table[header[bare]])
+            column = _to_numpy(table[header[bare]])
             if not isinstance(column, Iterable):
                 raise InvalidField(argument, f"expected a column {name!r}, got {column!r}")
             cells[name], divisors[name] = list(column), divisor
@@ -399,7 +400,7 @@ def columns_of(
     return Columns(columns, tags, at)
 
 
-def _held(value: Any) -> Any:
+def _to_numpy(value: Any) -> Any:
     """A JAX array as NumPy's; a traced one and anything else are unchanged, and then refused."""
     return np.asarray(value) if isinstance(value, jax.Array) and is_concrete(value) else value
 
@@ -437,7 +438,7 @@ def _scalar(value: object) -> object:
 
     None of a masked one. Times of NumPy, whose numbers have units of their own, are unchanged.
     """
-    value = _held(value)
+    value = _to_numpy(value)
     if value is np.ma.masked:
         return None
     if isinstance(value, np.ndarray) and value.ndim == 0:

@@ -436,7 +436,7 @@ def table(folder: str | Path, *, fitted: bool = True) -> Dataset:
     unknown = None in (measurements.tags or ())
     capacity = settings.capacity(len(tags), unknown)
     log = Log.from_rows(rows)
-    adjustable = _adjustable(log, rows.time, by_motion, by_sensor, delay)
+    adjustable = _with_parameters(log, rows.time, by_motion, by_sensor, delay)
     return Dataset(
         name=settings.text("name", folder.resolve().name),
         log=log,
@@ -489,7 +489,7 @@ def _odometry_notes(odometry: Columns[int | str], from_poses: bool) -> list[str]
     return notes
 
 
-def _adjustable(
+def _with_parameters(
     log: Log,
     time: np.ndarray,
     motion: Parametric[Motion],

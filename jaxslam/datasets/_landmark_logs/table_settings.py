@@ -29,7 +29,7 @@ from jaxslam.core.protocols import Associate, Motion, Sensor
 from jaxslam.core.types import JaxOrNumPy
 from jaxslam.core.validation import InvalidField, or_none, probability, require
 from jaxslam.datasets._dataset import Parameter
-from jaxslam.math._definite import asymmetric, indefinite
+from jaxslam.math._definite import is_asymmetric, is_indefinite
 from jaxslam.motion import _odometry_errors as odometry_errors
 from jaxslam.sensors import _range_errors as range_errors
 
@@ -448,7 +448,7 @@ class TableSettings:
                 f"{self._at('calibration', 'covariance')}: expected {len(names)} rows of numbers"
             )
         rows = np.array([self._numbers("calibration", "covariance", row, names) for row in matrix])
-        if asymmetric(rows, 1e-6) or indefinite(rows, 1e-6):  # written with six digits
+        if is_asymmetric(rows, 1e-6) or is_indefinite(rows, 1e-6):  # written with six digits
             raise ValueError(f"{self._at('calibration', 'covariance')}: expected a covariance")
         cov = np.zeros((len(all_names), len(all_names)))
         places = [all_names.index(name) for name in names]
@@ -511,7 +511,7 @@ class TableSettings:
                 raise ValueError(f"{place}: expected 3 rows of numbers ({', '.join(POSE)})")
             rows = [self._numbers("filter", "start_covariance", row, POSE) for row in matrix]
             cov = np.array(rows)
-            if asymmetric(cov) or indefinite(cov):
+            if is_asymmetric(cov) or is_indefinite(cov):
                 raise ValueError(f"{place}: expected a covariance")
             return cov
         if deviations is None:

@@ -68,7 +68,7 @@ class Bag:
             except StopIteration:
                 return
             except Exception as problem:  # of SQLite, zstd, struct, … where a bag is damaged
-                raise _unreadable(
+                raise _bag_error(
                     self.path, problem, f" after {count:,} messages of {', '.join(sorted(names))}"
                 ) from problem
             count += 1
@@ -121,7 +121,7 @@ def open_bag(path: str | Path) -> Iterator[Bag]:
         reader = AnyReader(files, default_typestore=types)
         reader.open()
     except Exception as problem:  # of SQLite, zstd, struct, … where a bag is damaged
-        raise _unreadable(path, problem) from problem
+        raise _bag_error(path, problem) from problem
     try:
         # Each part of a recording begins about when the part before it ends.
         order = sorted(range(len(files)), key=lambda k: reader.readers[k].start_time)
@@ -191,7 +191,7 @@ def is_bag(path: str | Path) -> bool:
     return Path(path).is_dir() or Path(path).suffix in _SUFFIXES
 
 
-def _unreadable(path: Path, problem: Exception, where: str = "") -> ValueError:
+def _bag_error(path: Path, problem: Exception, where: str = "") -> ValueError:
     """The error on a bag that is damaged, or on a file that is no bag."""
     if isinstance(problem, FileNotFoundError):
         missing = "metadata.yaml" if path.is_dir() else "file"

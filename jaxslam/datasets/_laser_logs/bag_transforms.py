@@ -130,7 +130,7 @@ class Frames:
         return self.above(base)[-1] == self.above(frame)[-1]
 
     def above(self, frame: str) -> list[str]:
-        """A frame, its parent, the parent of that, and so on."""
+        """The chain of a frame, its parent, the parent's parent, and so on."""
         path = [frame]
         while path[-1] in self._to and (parent := self._to[path[-1]][-1].parent) not in path:
             path.append(parent)
@@ -309,7 +309,7 @@ def mount_text(mount: LaserMount) -> str:
 
 
 def frame_pairs(transforms: Sequence[Transform]) -> tuple[FramePair, ...]:
-    """All pairs of frames with transforms, by name, and which of them move."""
+    """The pairs of frames with transforms, by name, and the mask of those that move."""
     by_pair: dict[tuple[str, str, bool], list[Transform]] = {}
     for edge in transforms:
         by_pair.setdefault((edge.parent, edge.child, edge.static), []).append(edge)

@@ -121,14 +121,14 @@ def rosbag(
     dropped: Counter[str] = Counter()
     with open_bag(path) as bag:
         corrections += bag.notes
-        laser = _chosen(bag, "scan", (LASER_SCAN, MULTI_ECHO), scan)
+        laser = _pick_topic(bag, "scan", (LASER_SCAN, MULTI_ECHO), scan)
         if laser is None:
             raise bag.error(
                 f"expected a topic of {LASER_SCAN} with messages, got {listed_topics(bag.topics)}"
             )
         wheels = None
         if odometry is None or ":" not in odometry:  # not two frames, as `odom:base_link`
-            wheels = _chosen(bag, "odometry", (ODOMETRY,), odometry)
+            wheels = _pick_topic(bag, "odometry", (ODOMETRY,), odometry)
         messages = _read(bag, laser, wheels, corrections)
         transforms = messages.transforms
         frame, *others = sorted({scan.frame for scan in messages.scans})
@@ -144,7 +144,7 @@ def rosbag(
             if topic.name not in (laser, wheels) and topic.type not in TRANSFORMS and topic.count:
                 dropped[f"messages {topic.name}"] = topic.count
         stamp, kept = in_order(bag, laser, "scans", messages.scans, dropped, corrections)
-        scans = [_ascending(messages.scans[k], upside_down) for k in kept]
+        scans = [_sort_angles(messages.scans[k], upside_down) for k in kept]
         corrections += source
         joined = _odometry_at(bag, stamp, messages, wheels, dropped, corrections)
     beams, limit = beams_of(scans, max_range, dropped, corrections)
@@ -291,7 +291,7 @@ def listed_topics(topics: Sequence[Topic]) -> str:
     return ", ".join(listed) or "no topics"
 
 
-def _chosen(bag: Bag, argument: str, kinds: tuple[str, ...], name: str | None) -> str | None:
+def _pick_topic(bag: Bag, argument: str, kinds: tuple[str, ...], name: str | None) -> str | None:
     """The named topic; else the only topic with messages of the first type that has any."""
     option = OPTIONS[argument]
     expected = " or ".join(kinds)
@@ -376,7 +376,7 @@ def _scan_of(
     )
 
 
-def _ascending(scan: _ScanMessage, upside_down: bool) -> _ScanMessage:
+def _sort_angles(scan: _ScanMessage, upside_down: bool) -> _ScanMessage:
     """The scan with increasing angles, seen from above."""
     angles = -scan.angles if upside_down else scan.angles
     if len(angles) > 1 and angles[1] < angles[0]:

@@ -1,7 +1,6 @@
 """The models and options of `DelayedSlam`, which its steps take; three of them are records."""
 
 import dataclasses
-import math
 from typing import Literal, get_args
 
 from jaxslam.association._rules import Known
@@ -12,8 +11,8 @@ from jaxslam.core.protocols import Associate, Filter, Motion, Sensor
 from jaxslam.core.validation import (
     InvalidField,
     at_least,
-    in_range,
     instance_of,
+    not_negative,
     one_of,
     or_none,
     positive,
@@ -27,8 +26,6 @@ from jaxslam.sensors._suite import on_ground
 
 Distance = Literal["mahalanobis", "bhattacharyya"]
 
-_not_negative = in_range(0.0, math.inf)
-
 
 @record
 class StoredMeasurements:
@@ -40,7 +37,7 @@ class StoredMeasurements:
 
     capacity: int = static(default=32, check=at_least(1))
     """W; in a full table the oldest stored measurement is marginalized out"""
-    spacing: Number = field(default=0.2, check=_not_negative)
+    spacing: Number = field(default=0.2, check=not_negative)
     """[m] least distance between the positions of stored measurements of one identity; a nearer
     measurement is `Status.DEFERRED`"""
 
@@ -66,7 +63,7 @@ class Hypotheses:
     """[1] distance from a hypothesis below which an intersection is that hypothesis; default
     the 99 % quantile of chi-square with two degrees of freedom for mahalanobis, 0.5 for
     bhattacharyya"""
-    decay: Number = field(default=0.5, check=_not_negative)
+    decay: Number = field(default=0.5, check=not_negative)
     """persistence lost by each measurement of its tag that does not confirm it. A hypothesis is
     deleted at 0: it survives persistence / decay outliers in a row"""
     patience: int = static(default=200, check=at_least(1))
@@ -90,7 +87,7 @@ class Promotion:
 
     persistence: Number = field(default=4.0, check=positive)
     """least persistence: 1 of the intersection, and 1 of each confirmation"""
-    lead: Number = field(default=2.0, check=_not_negative)
+    lead: Number = field(default=2.0, check=not_negative)
     """least difference of its persistence to that of each hypothesis that excludes it"""
     spread: Number = field(default=0.3, check=positive)
     """[1] largest standard deviation of its position relative to the sensor, over its range"""

@@ -15,8 +15,8 @@ from jaxslam.math import _linalg as linalg
 from jaxslam.math._xla import materialize
 from jaxslam.math.angles import wrap
 
-# The number of Gauss-Newton steps: few, because the hypothesis is a good initial value.
 _STEPS = 4
+"""Gauss-Newton steps: few, because the hypothesis is a good initial value."""
 
 
 class InitialEstimate(NamedTuple):

@@ -35,19 +35,19 @@ from jaxslam.filters._delayed.state import (
 from jaxslam.math._xla import materialize, where_any
 from jaxslam.math.stats import chi2_quantiles
 
-# The largest number of stored measurements of a landmark: two locate it, and the covariance of the
-# rest is small enough for the unrolled factors of `linalg`.
 _USED = 8
+"""The largest number of stored measurements of a landmark: two locate it, and the covariance of the
+rest is small enough for the unrolled factors of `linalg`."""
 
-# The significance level of the chi-square test that refuses a landmark.
 _UNLIKELY = 1e-3
+"""The significance level of the chi-square test that refuses a landmark."""
 
-# The least difference of -2 log likelihood between a landmark's position and its mirror solution:
-# that of 3 σ.
 _AMBIGUOUS = 9.0
+"""The least difference of -2 log likelihood between a landmark's position and its mirror solution:
+that of 3 σ."""
 
-# Two estimates so close to each other, relative to the distance, are the same position.
 _ONE_PLACE = 0.02
+"""Two estimates so close to each other, relative to the distance, are the same position."""
 
 
 class Promoted(NamedTuple):

@@ -185,7 +185,7 @@ def slots_where(
     hypotheses: Bool[Array, "C"] | None = None,
     stored: Bool[Array, "W"] | None = None,
 ) -> Bool[Array, "S"]:
-    """One mask of all slots, from masks of hypotheses and of stored measurements."""
+    """The mask of all slots, from masks of hypotheses and of stored measurements."""
     mask = jnp.zeros(layout.slots, bool)
     if hypotheses is not None:
         mask = mask.at[layout.of_hypotheses].set(hypotheses)

@@ -18,8 +18,8 @@ from jaxslam.math import _linalg as linalg
 from jaxslam.math._xla import where_any
 from jaxslam.sensors._suite import Suite
 
-# The tag of slots without a landmark: not -1, the tag of a measurement of unknown identity.
 _NONE = -2
+"""The tag of slots without a landmark: not -1, the tag of a measurement of unknown identity."""
 
 
 class _Compressed(NamedTuple):

@@ -28,7 +28,7 @@ class ToPoints(NamedTuple):
     """slots whose landmark became a point in this step"""
 
     def counts(self) -> dict[str, Array]:
-        """What a campaign counts."""
+        """The counts of a campaign."""
         return {"reduced": self.reduced}
 
 

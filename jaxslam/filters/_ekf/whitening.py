@@ -20,7 +20,7 @@ from jaxslam.math._gaussians import log_det_of_pivots
 from jaxslam.math._xla import materialize, no_inline
 
 
-@linalg.kept_whole
+@linalg.rematerialize
 def project(
     rows: Float[Array, "m Z C"], robot: Float[Array, "3 D"], landmark: Float[Array, "m L D"]
 ) -> Float[Array, "m Z D"]:
@@ -133,7 +133,7 @@ def _substitute(
     return both[:, :-1], both[:, -1]
 
 
-@linalg.kept_whole
+@linalg.rematerialize
 def whiten_by(inverse: Float[Array, "m Z Z"], rhs: Float[Array, "m Z k"]) -> Float[Array, "m Z k"]:
     """The product L⁻¹ B of each measurement, as a sum of Z outer products."""
     return linalg.total(inverse[:, :, k, None] * rhs[:, k, None] for k in range(inverse.shape[1]))

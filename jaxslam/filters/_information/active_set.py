@@ -39,7 +39,7 @@ def enter_link(
     i, j = jnp.where(on, i, n), jnp.where(on, j, n)
 
     def weakest_link(landmark: Array) -> tuple[Array, Array, Array, Array]:
-        """Its entry in the list, the other end, the link, and |link|²; -1 for a free entry."""
+        """The entry of a landmark's weakest link, its other end, Ω_ij and |Ω_ij|²; -1 if free."""
         row = state.neighbours.at[landmark].get(mode="fill", fill_value=n)
         links = state.links.at[landmark].get(mode="fill", fill_value=0)
         weight = jnp.where(row < n, (links**2).sum(axis=(1, 2)), -1.0)

@@ -37,7 +37,7 @@ from jaxslam.filters._particles.slam_particles import (
 from jaxslam.filters._reporting import has_distance, with_extra
 from jaxslam.math._arrays import Number
 from jaxslam.resampling._methods import systematic
-from jaxslam.resampling._weights import normalized, resampled_where
+from jaxslam.resampling._weights import normalize, resampled_where
 
 
 @record
@@ -135,8 +135,8 @@ class FastSlam(ParticleMapFilter):
         # w_p ← w_p p(scan | particle), Σ w = 1. Terms of measurements without a landmark compare
         # particles; they are no densities, so the log-likelihood is without them.
         log_matched = state.log_weight + proposal.log_matched
-        log_weight, _, some = normalized(log_matched + proposal.log_unmatched)
-        log_likelihood = normalized(log_matched)[1]
+        log_weight, _, some = normalize(log_matched + proposal.log_unmatched)
+        log_likelihood = normalize(log_matched)[1]
         nis = weighted_nis(innovations.nis, association.matched, log_weight)
         ess = 1.0 / jnp.exp(2 * log_weight).sum()
         resampled = ess < self.threshold * self.particles

@@ -32,7 +32,7 @@ from jaxslam.linearize._first_order import predicted_noise
 from jaxslam.math import _linalg as linalg
 from jaxslam.math._arrays import Number
 from jaxslam.math._gaussians import gaussian_terms, log_density, log_det_of
-from jaxslam.resampling._weights import normalized
+from jaxslam.resampling._weights import normalize
 from jaxslam.sensors._suite import Suite, split_scan
 
 
@@ -112,7 +112,7 @@ class ParticleLocalization(MonteCarloFilter):
         scan = zero_padding(scan)
         state = draw_start(state, key, self._start_region)
         likelihood = jax.vmap(partial(scan_likelihood, self, scan=scan))(state.pose)
-        log_likelihood = normalized(state.log_weight + likelihood.log_density.sum(axis=1))[1]
+        log_likelihood = normalize(state.log_weight + likelihood.log_density.sum(axis=1))[1]
         misfit = 0.5 * (likelihood.counted + likelihood.spread).sum(axis=1)
         # Recovery compares scans, and so leaves out how large their noise is.
         fit = 0.5 * likelihood.counted.sum(axis=1)

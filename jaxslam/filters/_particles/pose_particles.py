@@ -14,7 +14,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
-from jaxslam.core._numbers import held_array, is_concrete
+from jaxslam.core._numbers import as_array, is_concrete
 from jaxslam.core._record import record
 from jaxslam.math import _linalg as linalg
 from jaxslam.math._xla import change_where
@@ -106,7 +106,7 @@ class Box(Region):
 
 def box_ends(value: ArrayLike) -> ArrayLike:
     """The check of a box (2, 2): its lowest and highest (x, y), finite, with an inside."""
-    ends = held_array(value)
+    ends = as_array(value)
     numbers = np.asarray(ends) if is_concrete(ends) else None
     is_box = np.shape(ends) == (2, 2)
     if numbers is not None:

@@ -35,7 +35,7 @@ from jaxslam.filters._particles.slam_particles import ParticleInfo
 from jaxslam.math._arrays import Number
 from jaxslam.resampling._kld import bins_of, enough
 from jaxslam.resampling._methods import systematic
-from jaxslam.resampling._weights import effective_size, normalized, survivors
+from jaxslam.resampling._weights import effective_size, normalize, survivors
 
 
 def update_averages(
@@ -105,13 +105,14 @@ def resample_and_inject(
     )
 
 
-# The default least number of particles.
 _LEAST = 50
+"""The default of `MonteCarloFilter.least`."""
 
-# The bound on the number of particles: with this confidence the Kullback-Leibler divergence is
-# below the error, by bins of these sizes in x [m], y [m], θ [rad] (Fox 2003).
 _BINS = (0.5, 0.5, math.radians(15))
+"""Sizes of the bins in x [m], y [m], θ [rad] whose number bounds that of the particles."""
+
 _ERROR, _CONFIDENCE = 0.05, 0.99
+"""With this confidence the Kullback-Leibler divergence is below the error (Fox 2003)."""
 
 
 def _check_rates(rates: tuple[Number, Number]) -> tuple[Number, Number]:
@@ -198,7 +199,7 @@ class MonteCarloFilter(_Particles):
         used = jnp.arange(self.particles, dtype=active.dtype) < active
         log_weight = jnp.where(used, weight_resampled, -jnp.inf)
         # The sum becomes 1; its gradient is the resampling method's.
-        log_weight = log_weight - normalized(jax.lax.stop_gradient(log_weight))[1]
+        log_weight = log_weight - normalize(jax.lax.stop_gradient(log_weight))[1]
         log_weight = jnp.where(due, log_weight, state.log_weight)
         before = state.events
         return state._replace(
@@ -229,7 +230,7 @@ class MonteCarloFilter(_Particles):
             fit: the misfit that recovery compares with other scans (`update_averages`).
             measured: number of measurements of the scan.
         """
-        weight, _, some = normalized(state.log_weight - misfit)
+        weight, _, some = normalize(state.log_weight - misfit)
         even = jnp.where(active_mask(state), -jnp.log(state.active.astype(weight.dtype)), -jnp.inf)
         weight = jnp.where(some, weight, even)
         ess = effective_size(weight)

@@ -155,7 +155,7 @@ def propose_pose(
 def _predict_measurements(particle: SlamParticles, sensor: Sensor) -> Prediction:
     """The `Prediction` of one particle's map, with landmarks correlated only through the pose."""
 
-    def linearized() -> tuple[Float[Array, "N Z"], Float[Array, "N Z 3"], Float[Array, "N Z Z"]]:
+    def linearize_map() -> tuple[Float[Array, "N Z"], Float[Array, "N Z 3"], Float[Array, "N Z Z"]]:
         """The prediction ẑ, H_x and H_l C H_lᵀ of each landmark."""
 
         def linearize(landmark: Array, cov: Array) -> tuple[Array, Array, Array]:
@@ -166,12 +166,12 @@ def _predict_measurements(particle: SlamParticles, sensor: Sensor) -> Prediction
         return jax.vmap(linearize)(particle.landmarks, particle.covs)
 
     def measurements() -> tuple[Float[Array, "N Z"], Float[Array, "N Z Z"]]:
-        expected, by_pose, landmark_cov = linearized()
+        expected, by_pose, landmark_cov = linearize_map()
         robot = jax.vmap(lambda h: linalg.matmul(linalg.matmul(h, particle.pose_cov), h.T))(by_pose)
         return expected, linalg.symmetrize(robot + landmark_cov)
 
     def cross() -> Float[Array, "N Z N Z"]:
-        _, by_pose, landmark_cov = linearized()
+        _, by_pose, landmark_cov = linearize_map()
         # Landmarks i and j are correlated by the pose: H_i P H_jᵀ, and H_l C H_lᵀ where i = j.
         shared = jnp.einsum("izx,xy,jwy->izjw", by_pose, particle.pose_cov, by_pose)
         j = jnp.arange(particle.alive.shape[0])

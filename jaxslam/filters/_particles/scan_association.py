@@ -12,8 +12,8 @@ from jaxslam.math._arrays import Number
 from jaxslam.math._gaussians import is_inside
 from jaxslam.math.stats import chi2_quantile
 
-# The probability that a measurement of a landmark lies within d², without a gate.
 _NEAR = 0.99
+"""The probability that a measurement of a landmark lies within d², without a gate."""
 
 
 class ParticleAssociation(NamedTuple):

@@ -132,12 +132,12 @@ def with_unit_blocks(
     return jnp.where(both, cov, jnp.eye(2 * m, dtype=cov.dtype).reshape(m, 2, m, 2))
 
 
-# Candidates that are scored together: more cost memory, in proportion.
 _BLOCK = 32
+"""Candidates that are scored together: more cost memory, in proportion."""
 
-# Hypotheses that are fitted as a whole, besides the best of each pair: the merit of a hypothesis
-# ignores correlations, so its order is only approximate.
 _FINALISTS = 8
+"""Hypotheses that are fitted as a whole, besides the best of each pair: the merit of a hypothesis
+ignores correlations, so its order is only approximate."""
 
 
 class GeometricMatch(NamedTuple):

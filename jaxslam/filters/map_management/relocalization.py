@@ -23,7 +23,7 @@ from jaxslam.filters.map_management._geometric_matching import (
 from jaxslam.filters.map_management._point_pairs import PointSets
 from jaxslam.math import _linalg as linalg
 
-__all__ = ["lost", "points_of_map", "relocalize", "relocated", "seen_points"]
+__all__ = ["forget_pose", "points_of_map", "relocalize", "replace_pose", "seen_points"]
 
 
 class _Relocalization(NamedTuple):
@@ -156,7 +156,9 @@ def points_of_map(
     return joint.landmarks, cov[3:, 3:], joint.alive
 
 
-def lost(joint: Joint, chart: Chart, pose_cov: ArrayLike, *, square_root: bool = False) -> Joint:
+def forget_pose(
+    joint: Joint, chart: Chart, pose_cov: ArrayLike, *, square_root: bool = False
+) -> Joint:
     """The state with the robot's pose unknown and its map unchanged.
 
     In coordinates P_RR ← pose_cov, P_RM ← 0, and P_MM does not change: the pose is marginalized
@@ -165,7 +167,7 @@ def lost(joint: Joint, chart: Chart, pose_cov: ArrayLike, *, square_root: bool =
     Raises ValueError on landmarks other than points, a linearizer with a memory, or a pose_cov
     that is no covariance.
     """
-    with refusals_of("lost"):
+    with refusals_of("forget_pose"):
         check_point_map(joint)
         require("pose_cov", pose_cov, covariance(3))
     cov = cov_of_coordinates(joint, chart, square_root=square_root)
@@ -174,7 +176,7 @@ def lost(joint: Joint, chart: Chart, pose_cov: ArrayLike, *, square_root: bool =
     return with_cov_of_coordinates(joint, chart, cov, square_root=square_root)
 
 
-def relocated(
+def replace_pose(
     joint: Joint,
     chart: Chart,
     slot: Int[Array, "M"],
@@ -195,10 +197,10 @@ def relocated(
         slot: (M,) landmark of each measurement, -1 for none, from `relocalize`.
         seen, seen_covs: the scan in the robot's frame, from `seen_points`.
     Raises:
-        ValueError: as `lost`, or on shapes that do not fit.
+        ValueError: as `forget_pose`, or on shapes that do not fit.
     """
     m, capacity = np.shape(slot)[0], joint.landmarks.shape[0]
-    with refusals_of("relocated"):
+    with refusals_of("replace_pose"):
         check_point_map(joint)
         require("seen", seen, array_of(m, 2))
         require("seen_covs", seen_covs, array_of(m, 2, 2))

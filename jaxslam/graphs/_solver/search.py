@@ -297,22 +297,34 @@ def _damping_after(
 def _propose(problem: _Problem, search: _Search) -> _Search:
     """The search with its next trial, or at its end.
 
-    A damped step that is small does not prove that the search has converged: the factor is that of
-    H + λD. The next one is undamped. Besides the endings of `_ending_of`, λ above its maximum is a
-    stall.
+    `_ending_of` decides by the step δ of (H + λD) δ = -g whether the search ends. If not:
+
+    | H + λD   | δ             | next trial | next λ |
+    |----------|---------------|------------|--------|
+    | singular |               | none       | higher |
+    | regular  | small, damped | none       | 0      |
+    | regular  | other         | x ⊞ δ      | λ      |
+
+    A damped step that is small does not prove that the search has converged, since the factor is
+    not that of H; hence λ = 0. A search whose next λ is above its maximum has stalled.
     """
-    plan, tolerance = problem.plan, problem.tolerance
+    plan, chi2 = problem.plan, search.system.chi2
     undamped = search.damping == 0
     step, decrease, regular_columns = _marquardt(plan, search.system, search.damping)
     regular = regular_columns.all(axis=0)
-    culprit = plan.order[jnp.argmin(regular_columns, axis=0)].astype(jnp.int32)
-    is_first = undamped & ~regular & ~(search.singular >= 0)
-    singular = jnp.where(is_first, culprit, search.singular)
-    chi2, eps = search.system.chi2, float(jnp.finfo(search.system.chi2.dtype).eps)
-    least = jnp.maximum(tolerance * chi2, _SUM_ROUNDING * eps * (chi2 + 1))
+
+    # Small: the tolerance, the rounding of χ², or that of the coordinates is larger.
+    eps = float(jnp.finfo(chi2.dtype).eps)
+    least = jnp.maximum(problem.tolerance * chi2, _SUM_ROUNDING * eps * (chi2 + 1))
     small = decrease <= jnp.maximum(least, _change_by_rounding(problem, search))
-    # Only regularity at the end matters, not on the way.
+
+    # The variable at which H first failed; forgotten where H is regular at the end, which alone
+    # matters, not the way there.
+    failed = plan.order[jnp.argmin(regular_columns, axis=0)].astype(jnp.int32)
+    fails_first = undamped & ~regular & (search.singular < 0)
+    singular = jnp.where(fails_first, failed, search.singular)
     singular = jnp.where(undamped & regular & small, -1, singular)
+
     ends, ending = _ending_of(
         small=small,
         undamped=undamped,
@@ -321,23 +333,23 @@ def _propose(problem: _Problem, search: _Search) -> _Search:
         refused=search.undamped_refused,
         decrease=decrease,
     )
-    # Where the factor failed, or has to confirm that the search has converged, there is no step but
-    # only another λ.
-    higher = jnp.maximum(_FACTOR * search.damping, _FIRST_DAMPING)
-    damping = jnp.where(regular, search.damping, higher)
     to_confirm = regular & small & ~undamped & ~ends
-    damping = jnp.where(to_confirm, 0.0, damping)
+    higher = jnp.maximum(_FACTOR * search.damping, _FIRST_DAMPING)
+    damping = jnp.where(regular, jnp.where(to_confirm, 0.0, search.damping), higher)
     stalls = ~ends & (damping > _MOST_DAMPING)
     ends, ending = ends | stalls, jnp.where(stalls, Ending.STALLED, ending)
+
+    # A search of the batch that is over keeps its λ, its ending and its singular variable.
+    going = search.going
     return search._replace(
         trial=retract(search.variables, step, plan),
         decrease=decrease,
-        stepped=regular & (~small | undamped),
-        damping=jnp.where(search.going, damping, search.damping),
+        stepped=regular & ~to_confirm,
+        damping=jnp.where(going, damping, search.damping),
         undamped_again=search.undamped_again | (to_confirm & (singular >= 0)),
-        singular=jnp.where(search.going, singular, search.singular),
-        going=search.going & ~ends & (search.steps < problem.iterations),
-        ending=jnp.where(search.going & ends, ending, search.ending).astype(jnp.int32),
+        singular=jnp.where(going, singular, search.singular),
+        going=going & ~ends & (search.steps < problem.iterations),
+        ending=jnp.where(going & ends, ending, search.ending).astype(jnp.int32),
     )
 
 

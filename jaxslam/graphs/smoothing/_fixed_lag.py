@@ -125,7 +125,7 @@ class FixedLag(Filter):
         )
         # The oldest step leaves before the new motion enters: W steps at every scan.
         prior = marginalize_oldest(state.prior, system, state.steps, state.at, joint.tag)
-        state = _finite_or(state._replace(prior=prior), self._started_at(state.joint))
+        state = _restart_unless_finite(state._replace(prior=prior), self._started_at(state.joint))
         root = linalg.root_psd(motion.noise_cov(state.joint.pose, u))
         steps, at = shift(state.steps, state.at, u, root, joint.pose)
         return _WindowState(joint, state.prior, steps, at)
@@ -168,7 +168,8 @@ class FixedLag(Filter):
         newest = joint._replace(pose=at.path[-1], landmarks=landmarks, cov=cov)
         after = _WindowState(newest, state.prior, steps, at)
         exhausted = jnp.asarray(info.exhausted) | ~_is_finite(after)
-        return _finite_or(after, self._started_at(joint)), info._replace(exhausted=exhausted)
+        info = info._replace(exhausted=exhausted)
+        return _restart_unless_finite(after, self._started_at(joint)), info
 
     def estimate(self, state: _WindowState) -> Estimate:
         return self._ekf.estimate(state.joint)
@@ -199,7 +200,7 @@ def _is_finite(state: _WindowState) -> Bool[Array, ""]:
     return jnp.stack([jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(state)]).all()
 
 
-def _finite_or(state: _WindowState, restart: _WindowState) -> _WindowState:
+def _restart_unless_finite(state: _WindowState, restart: _WindowState) -> _WindowState:
     """The state if all its numbers are finite, else the restart."""
     finite = _is_finite(state)
     chosen: _WindowState = jax.tree.map(lambda a, b: jnp.where(finite, a, b), state, restart)

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from jaxslam._driver import check_run, run
 from jaxslam.association._rules import Known
-from jaxslam.core._numbers import held_array
+from jaxslam.core._numbers import as_array
 from jaxslam.core._record import field, function_of, record, set_field, static
 from jaxslam.core._validation import motion_model, sensor_model
 from jaxslam.core.protocols import Associate, Component, Filter, Motion, Sensor, Wrapper
@@ -126,7 +126,7 @@ class LogEstimator(Component):
                 f"{sensor.landmark} of {sensor.name}",
             )
         for start in ("pose", "pose_cov"):
-            set_field(self, start, held_array(getattr(self, start)))
+            set_field(self, start, as_array(getattr(self, start)))
         self._check(LogEstimator, {"solve": "log, key"})
 
     def solve(self, log: Log, key: Array) -> Trace:

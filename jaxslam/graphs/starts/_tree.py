@@ -70,7 +70,9 @@ def _along_a_tree(graph: Graph, relative: Relative, nearest: bool) -> Graph:
     cost = np.ones(len(ends[0]))
     if nearest:
         cost[: len(first)] += np.abs(second - first)
-    tree = scipy.sparse.coo_array((cost[at], tuple(edges.T)), shape=(count + 1, count + 1)).tocsr()
+    # SciPy 1.13's spanning tree takes indices of 32 bits alone.
+    ends = tuple(edges.T.astype(np.int32))
+    tree = scipy.sparse.coo_array((cost[at], ends), shape=(count + 1, count + 1)).tocsr()
     if nearest:
         tree = scipy.sparse.csgraph.minimum_spanning_tree(tree)
     order, before = scipy.sparse.csgraph.breadth_first_order(tree, count, directed=False)

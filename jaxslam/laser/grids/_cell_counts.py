@@ -176,7 +176,7 @@ def _cross(
     steps = jnp.where(live, jnp.abs(last - first).sum(axis=1), 0)
     slope = jnp.where(delta != 0, 1.0 / jnp.where(delta != 0, delta, 1.0), 0.0)
 
-    def unfinished(state: tuple[Array, ...]) -> Array:
+    def goes_on(state: tuple[Array, ...]) -> Array:
         return (state[2] < steps).any()
 
     def step(state: tuple[Array, ...]) -> tuple[Array, ...]:
@@ -195,7 +195,7 @@ def _cross(
         return misses, jnp.where(going[:, None], cell + move, cell), arrived
 
     begin: tuple[Array, ...] = (misses, first, jnp.zeros_like(steps))
-    misses, *_ = jax.lax.while_loop(unfinished, step, begin)
+    misses, *_ = jax.lax.while_loop(goes_on, step, begin)
     return misses, last[:, 1] * width + last[:, 0]
 
 

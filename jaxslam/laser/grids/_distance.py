@@ -139,7 +139,7 @@ def _envelope(column: Int[Array, "W H"]) -> Int[Array, "W H"]:
         beyond = cell * run - rise
         return cell + (beyond < 0).astype(jnp.int32) - (beyond >= run).astype(jnp.int32)
 
-    def unfinished(state: tuple[Array, ...]) -> Array:
+    def goes_on(state: tuple[Array, ...]) -> Array:
         return (state[0] < width).any()
 
     def step(state: tuple[Array, ...]) -> tuple[Array, ...]:
@@ -168,7 +168,7 @@ def _envelope(column: Int[Array, "W H"]) -> Int[Array, "W H"]:
         h[:rows],
         begins[:rows],
     )
-    _, top, parabola, begins, *_ = jax.lax.while_loop(unfinished, step, start)
+    _, top, parabola, begins, *_ = jax.lax.while_loop(goes_on, step, start)
     # Parabolas are in the order of their columns, so the last to begin is the lowest.
     depth = jnp.arange(width, dtype=jnp.int32)[:, None]
     first = jnp.where(depth <= top[None, :], begins.reshape(width, rows), width)

@@ -39,7 +39,7 @@ from jaxslam.laser.grids.beam_models._beam_model import BeamModel, log_likelihoo
 from jaxslam.math._arrays import Number, in_dtype
 from jaxslam.math._xla import no_inline
 from jaxslam.math.angles import wrap
-from jaxslam.resampling._weights import normalized
+from jaxslam.resampling._weights import normalize
 
 _BEAM = ("range [m]", "angle [rad]")
 """Measurements of a beam in a log."""
@@ -232,7 +232,7 @@ class GridLocalization(MonteCarloFilter):
         blocked = ~on_map | (jnp.asarray(self.grid.log_odds > 0)[i, j])
         fit = jnp.where(blocked, jnp.inf, fit)
         misfit = jnp.where(blocked, jnp.inf, jnp.asarray(self.exponent, fit.dtype) * fit)
-        evidence = normalized(state.log_weight - misfit)[1]
+        evidence = normalize(state.log_weight - misfit)[1]
         blocked = blocked & active_mask(state)
         state, report = self.weigh(state, misfit, fit, beams.valid.sum())
         report = report._replace(blocked=blocked.sum(dtype=jnp.int32))

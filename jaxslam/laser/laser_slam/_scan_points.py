@@ -145,7 +145,7 @@ def _surfaces(points: Points, span: Int[Array, ""]) -> Surface:
 def _scans_since_change(
     ranges: Float[np.ndarray, "K B"], met: Bool[np.ndarray, "K B"]
 ) -> Int[np.ndarray, "K"]:
-    """How many scans back the last one is that differs (`Scans.changed`); 1 for the first."""
+    """The number of scans back to the last one that differs (`Scans.changed`); 1 for the first."""
     changed = np.zeros(len(ranges), int)
     # From the farthest to the nearest, so that the nearest that differs counts.
     for back in range(min(_BACK, len(ranges) - 1), 0, -1):

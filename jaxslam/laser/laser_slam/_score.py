@@ -15,7 +15,7 @@ from jaxslam.laser.laser_slam import _end_covariances as end_covariances
 from jaxslam.laser.laser_slam._assembly import ROOM, relative_covs
 from jaxslam.laser.laser_slam._records import LoopOutcome, Loops, Solved
 from jaxslam.math import numpy_poses as poses
-from jaxslam.math._definite import invertible
+from jaxslam.math._definite import is_invertible
 
 TOGETHER = 512
 """Pairs of keyframes whose marginals are computed at once. A pair adds a block to the Cholesky
@@ -90,7 +90,7 @@ def relation_nees(
     i, j = np.asarray(first), np.asarray(second)
     e = poses.between(poses.between(solved.poses[i], solved.poses[j]), np.asarray(z))
     nees = np.full(len(e), np.nan)
-    regular = invertible(cov)
+    regular = is_invertible(cov)
     nees[regular] = np.einsum(
         "ri,ri->r", e[regular], np.linalg.solve(cov[regular], e[regular][..., None])[..., 0]
     )

@@ -99,7 +99,7 @@ def of_prior(prior: Prior, pose: Float[Array, "3"], middle: Float[Array, "2"]) -
     )
 
 
-def linearized(of: Quadratic) -> tuple[Float[Array, "3 3"], Float[Array, "3"]]:
+def normal_equations(of: Quadratic) -> tuple[Float[Array, "3 3"], Float[Array, "3"]]:
     """Gauss-Newton's curvature (3, 3) and half of the slope (3,) of a cost by (t, θ), at no motion.
 
     There r = (1, 0) and ∂r/∂θ = (0, 1).

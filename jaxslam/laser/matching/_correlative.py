@@ -5,6 +5,7 @@ By branch and bound: blocks of shifts are bounded, divided and left out.
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -13,13 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.core._record import field, record, static
-from jaxslam.core.validation import (
-    at_least,
-    finite,
-    in_range,
-    or_none,
-    positive,
-)
+from jaxslam.core.validation import at_least, in_range, not_negative, or_none, positive
 from jaxslam.laser.grids._distance import near_distances
 from jaxslam.laser.grids._grid import Field, Grid, interpolate, to_cells
 from jaxslam.laser.matching._field import field_cost
@@ -101,23 +96,30 @@ def _best_shift(
     )
     corner = jnp.asarray(np.array([[0, 0], [0, 1], [1, 0], [1, 1]], np.int32))
 
-    def unfinished(state: tuple[Array, _Nodes, Array, _Best]) -> Array:
+    def goes_on(state: tuple[Array, _Nodes, Array, _Best]) -> Array:
         size, _, value, best = state
         # With `count` blocks or fewer only roots are left, the best of them on top.
         rest_is_worse = (size <= count) & (value[jnp.maximum(size - 1, 0)] <= best.value)
-        goes_on = (size > 0) & ~rest_is_worse
-        return jnp.asarray(goes_on & (best.value <= above) if first else goes_on)
+        is_open = (size > 0) & ~rest_is_worse
+        return jnp.asarray(is_open & (best.value <= above) if first else is_open)
 
     def step(state: tuple[Array, _Nodes, Array, _Best]) -> tuple[Array, _Nodes, Array, _Best]:
         size, stack, value, best = state
-        at = size - 1 - jnp.arange(_CHUNK, dtype=size.dtype)
-        live = (at >= 0) & (value[jnp.maximum(at, 0)] > best.value)
-        parent = jax.tree.map(lambda part: jnp.repeat(part[jnp.maximum(at, 0)], 4, axis=0), stack)
+        # Take the top of the stack; places below its bottom hold no block.
+        place = size - 1 - jnp.arange(_CHUNK, dtype=size.dtype)
+        index = jnp.maximum(place, 0)
+        live = (place >= 0) & (value[index] > best.value)
+
+        # Divide each block into four, and bound these.
+        parent = jax.tree.map(lambda part: jnp.repeat(part[index], 4, axis=0), stack)
         level = parent.level - 1
         shift = parent.shift + (1 << level)[:, None] * jnp.tile(corner, (_CHUNK, 1))
         child = _Nodes(level, parent.turn, shift)
         bound = bound_of(child)
-        good = jnp.repeat(live, 4) & jnp.all(shift <= shifts, axis=1) & (bound > best.value)
+        in_window = jnp.repeat(live, 4) & jnp.all(shift <= shifts, axis=1)
+        good = in_window & (bound > best.value)
+
+        # Single shifts may be the best.
         leaf = level == 0
         score = jnp.where(good & leaf, bound, -jnp.inf)
         if counts is not None:
@@ -130,9 +132,10 @@ def _best_shift(
             jnp.where(better, shift[top], best.shift),
             best.divided + live.sum(dtype=jnp.int32),
         )
+
+        # Push the others: the shallow ones lowest, and of a level the best bound on top. What is
+        # not pushed follows, above the new size, where it is not read.
         pushed = good & ~leaf & (bound > best.value)
-        # Pushed children first, the shallow ones lowest, and of a level the best bound on top. The
-        # children that are not pushed follow, above the new size, where they are not read.
         rank = jnp.lexsort((bound, -level, ~pushed))
         base = size - jnp.minimum(size, _CHUNK)
 
@@ -146,7 +149,7 @@ def _best_shift(
     zero = jnp.zeros((), jnp.int32)
     nothing = _Best(jnp.asarray(above, bounds.dtype), zero, jnp.zeros(2, jnp.int32), zero)
     size = jnp.asarray(count, jnp.int32)
-    *_, best = jax.lax.while_loop(unfinished, step, (size, stack, value, nothing))
+    *_, best = jax.lax.while_loop(goes_on, step, (size, stack, value, nothing))
     return best
 
 
@@ -164,10 +167,67 @@ _REACH = 4.0
 """Distance in σ beyond which a point scores 0, where exp(-d²/2σ²) is below 3.4e-4."""
 
 
-def _at_least_zero(value: float) -> float:
-    """The check of a finite number >= 0."""
-    finite(least=0.0)(value)
-    return value
+class _Lattice(NamedTuple):
+    """The poses of a window, and the scores of the points of a scan at them."""
+
+    start: Float[Array, "3"]
+    turns: Float[Array, "H"]
+    """headings [rad]"""
+    axes: Float[Array, "2 2"]
+    """[m] the shift by a row, and by a column, one a column"""
+    cells: Int[Array, "H N 2"]
+    """(row, column) of each point in the table, at the start with each heading"""
+    table: Float[Array, "L H W"]
+    """`Scores.table`"""
+    valid: Bool[Array, "N"]
+    """mask of the points"""
+    total: Float[Array, ""]
+    """their number, at least 1"""
+    sigma: float
+    """[m]"""
+    prior: Prior | None
+
+    def pose(self, at: _Best) -> Float[Array, "3"]:
+        """The pose of a heading and a shift."""
+        position = self.start[:2] + self.axes @ at.shift.astype(self.axes.dtype)
+        return jnp.concatenate([position, wrap(self.turns[at.turn])[None]])
+
+    def mean_score(self, nodes: _Nodes) -> Float[Array, "n"]:
+        """The mean score of the points, at most, within each block."""
+        _, height, width = self.table.shape
+        cell = self.cells[nodes.turn] + nodes.shift[:, None, :]
+        row = jnp.clip(cell[..., 0], 0, height - 1)
+        column = jnp.clip(cell[..., 1], 0, width - 1)
+        # A flat index into (level, row, column): one gather.
+        flat = (nodes.level[:, None] * height + row) * width + column
+        score = self.table.reshape(-1)[flat]
+        return jnp.where(self.valid, score, 0.0).sum(axis=1) / self.total
+
+    def prior_share(self, nodes: _Nodes) -> Float[Array, "n"]:
+        """The score eᵀ Λ e/(2 σ² n) that a prior takes, at least, within each block.
+
+        At its middle √(eᵀ Λ e) is exact; at a corner, u from there, it is less by √(uᵀ Λ u) at
+        most.
+        """
+        prior, dtype = self.prior, self.start.dtype
+        if prior is None:
+            return jnp.zeros(len(nodes.turn), dtype)
+        half = 0.5 * ((1 << nodes.level) - 1).astype(dtype)
+        middle = nodes.shift.astype(dtype) + half[:, None]
+        position = middle @ self.axes.T + self.start[None, :2]
+        pose = jnp.concatenate([position, self.turns[nodes.turn][:, None]], axis=1)
+        e = jax.vmap(prior.error)(pose)
+        square = jnp.maximum(((e @ prior.information) * e).sum(axis=1), 0.0)
+        # Of a block of half side 1; those of the opposite corners are the same.
+        u = jnp.asarray([[1.0, 1.0], [1.0, -1.0]], dtype) @ self.axes.T
+        far = jnp.maximum(((u @ prior.information[:2, :2]) * u).sum(axis=1).max(), 0.0)
+        least = jnp.maximum(jnp.sqrt(square) - half * jnp.sqrt(far), 0.0)
+        least = jnp.where(nodes.level == 0, square, least**2)
+        return least / (2 * self.sigma**2 * self.total)
+
+    def bound(self, nodes: _Nodes) -> Float[Array, "n"]:
+        """An upper bound of the score within each block; of a single shift the score."""
+        return self.mean_score(nodes) - self.prior_share(nodes)
 
 
 def _power_of_two(value: int) -> int:
@@ -202,9 +262,9 @@ class Correlative(Matcher):
     """
 
     _: dataclasses.KW_ONLY
-    window: float = static(default=0.3, check=_at_least_zero)
+    window: float = static(default=0.3, check=not_negative)
     """[m] to either side"""
-    turn_window: float = static(default=float(np.deg2rad(20.0)), check=_at_least_zero)
+    turn_window: float = static(default=float(np.deg2rad(20.0)), check=not_negative)
     """[rad] to either side"""
     turn: float = static(default=float(np.deg2rad(0.5)), check=positive)
     """[rad] between headings"""
@@ -254,87 +314,62 @@ class Correlative(Matcher):
         start: Float[Array, "3"],
         prior: Prior | None = None,
     ) -> Match:
-        sigma, block, shifts, levels = self.sigma, self.block, self._shifts, self._levels
-        ambiguous, apart = in_dtype((self.ambiguous, self.apart), start.dtype)
-        axis = np.arange(-shifts, shifts + 1, block)
-        corners = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1)
-        corners = corners.reshape(-1, 2).astype(np.int32)  # (rows, columns) of the roots
+        sigma, shifts, levels, dtype = self.sigma, self._shifts, self._levels, start.dtype
+        ambiguous, apart = in_dtype((self.ambiguous, self.apart), dtype)
+        field = prepared.field
+
+        # The lattice.
         steps = int(np.ceil(self.turn_window / self.turn - 1e-9))
-        turns = start[2] + jnp.asarray(self.turn * np.arange(-steps, steps + 1), start.dtype)
-        count = jnp.maximum(points.valid.sum(dtype=start.dtype), 1)
-        _, height, width = prepared.table.shape
-        cell_size = prepared.field.resolution
-        axes = cell_size * se2.rotation(prepared.field.origin[2])[:, ::-1]  # of a row, of a column
+        turns = start[2] + jnp.asarray(self.turn * np.arange(-steps, steps + 1), dtype)
 
-        def cells(turn: Array) -> Int[Array, "N 2"]:
-            """The cells (row, column) of the points at the start with a heading."""
+        def cells_at(turn: Array) -> Int[Array, "N 2"]:
             moved = points.position @ se2.rotation(turn).T + start[None, :2]
-            at = to_cells(prepared.field.origin, prepared.field.resolution, moved)[:, ::-1]
-            return jnp.floor(at).astype(jnp.int32) + block
+            cell = to_cells(field.origin, field.resolution, moved)[:, ::-1]
+            return jnp.floor(cell).astype(jnp.int32) + self.block  # of the table, with its border
 
-        cells_at = jax.vmap(cells)(turns)
-
-        def mean_score_of(nodes: _Nodes) -> Float[Array, "n"]:
-            """The mean score of the points, at most, within each block."""
-            at = cells_at[nodes.turn] + nodes.shift[:, None, :]
-            row, column = jnp.clip(at[..., 0], 0, height - 1), jnp.clip(at[..., 1], 0, width - 1)
-            # A flat index into (level, row, column): one gather.
-            flat = (nodes.level[:, None] * height + row) * width + column
-            score = prepared.table.reshape(-1)[flat]
-            return jnp.where(points.valid, score, 0.0).sum(axis=1) / count
-
-        def prior_share_of(nodes: _Nodes) -> Float[Array, "n"]:
-            """The score that a prior takes, at least, within each block.
-
-            At the middle it is √(eᵀ Λ e); at a corner it is less by √(uᵀ Λ u) at most.
-            """
-            if prior is None:
-                return jnp.zeros(len(nodes.turn), start.dtype)
-            half = 0.5 * ((1 << nodes.level) - 1).astype(start.dtype)
-            middle = (nodes.shift.astype(half.dtype) + half[:, None]) @ axes.T + start[None, :2]
-            pose = jnp.concatenate([middle, turns[nodes.turn][:, None]], axis=1)
-            e = jax.vmap(prior.error)(pose)
-            square = jnp.maximum(((e @ prior.information) * e).sum(axis=1), 0.0)
-            corner = jnp.asarray([[1.0, 1.0], [1.0, -1.0]], start.dtype) @ axes.T
-            far = ((corner @ prior.information[:2, :2]) * corner).sum(axis=1).max()
-            least = jnp.maximum(jnp.sqrt(square) - half * jnp.sqrt(jnp.maximum(far, 0.0)), 0.0)
-            least = jnp.where(nodes.level == 0, square, least**2)
-            return least / (2 * sigma**2 * count)
-
-        def bound_of(nodes: _Nodes) -> Float[Array, "n"]:
-            return mean_score_of(nodes) - prior_share_of(nodes)
-
-        def roots_of(turn: Array) -> _Nodes:
-            full = jnp.full(len(corners), levels, jnp.int32)
-            return _Nodes(full, jnp.broadcast_to(turn, full.shape), jnp.asarray(corners))
-
-        headings = jnp.arange(len(turns), dtype=jnp.int32)
-        # One heading after another: the scores of all at once would need N times the memory.
-        bounds = jax.lax.map(lambda turn: bound_of(roots_of(turn)), headings).reshape(-1)
-        # (heading, corner) to a list of blocks.
-        roots = jax.tree.map(
-            lambda part: part.reshape(-1, *part.shape[2:]), jax.vmap(roots_of)(headings)
+        lattice = _Lattice(
+            start=start,
+            turns=turns,
+            axes=field.resolution * se2.rotation(field.origin[2])[:, ::-1],
+            cells=jax.vmap(cells_at)(turns),
+            table=prepared.table,
+            valid=points.valid,
+            total=jnp.maximum(points.valid.sum(dtype=dtype), 1),
+            sigma=sigma,
+            prior=prior,
         )
-        best = _best_shift(bound_of, roots, bounds, levels, shifts)
+
+        # Blocks that cover the window, (heading, corner), and then a list of them.
+        axis = np.arange(-shifts, shifts + 1, self.block, dtype=np.int32)
+        corners = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
+        size = len(turns), len(corners)
+        blocks = _Nodes(
+            level=jnp.full(size, levels, jnp.int32),
+            turn=jnp.broadcast_to(jnp.arange(len(turns), dtype=jnp.int32)[:, None], size),
+            shift=jnp.broadcast_to(jnp.asarray(corners), (*size, 2)),
+        )
+        # One heading after another: the scores of all at once would need N times the memory.
+        bounds = jax.lax.map(lattice.bound, blocks).reshape(-1)
+        roots = jax.tree.map(lambda part: part.reshape(-1, *part.shape[2:]), blocks)
+
+        # The best pose, and whether one apart from it is nearly as good.
+        search = partial(_best_shift, lattice.bound, roots, bounds, levels, shifts)
+        best = search()
         is_ambiguous: Array | bool = False
         if ambiguous is not None:
             by_turn = length_of(points) * float(self.turn)
 
-            def is_apart(nodes: _Nodes) -> Array:
-                way = cell_size * (nodes.shift - best.shift[None]).astype(start.dtype)
-                turned = jnp.abs(nodes.turn - best.turn).astype(start.dtype)
+            def is_apart(nodes: _Nodes) -> Bool[Array, "n"]:
+                way = field.resolution * (nodes.shift - best.shift[None]).astype(dtype)
+                turned = jnp.abs(nodes.turn - best.turn).astype(dtype)
                 return jnp.hypot(*way.T) + by_turn * turned > apart
 
             limit = ambiguous * best.value
-            rival = _best_shift(
-                bound_of, roots, bounds, levels, shifts, above=limit, counts=is_apart, first=True
-            )
-            is_ambiguous = rival.value > limit
-        pose = jnp.concatenate(
-            [start[:2] + axes @ best.shift.astype(axes.dtype), wrap(turns[best.turn])[None]]
-        )
+            is_ambiguous = search(above=limit, counts=is_apart, first=True).value > limit
+
+        pose = lattice.pose(best)
         moved = points.position @ se2.rotation(pose[2]).T + pose[None, :2]
-        residual = interpolate(prepared.field, moved)
+        residual = interpolate(field, moved)
         weight = (points.valid & (residual < 3 * sigma)).astype(residual.dtype)
         leaf = _Nodes(jnp.zeros(1, jnp.int32), best.turn[None], best.shift[None])
         return make_match(
@@ -343,7 +378,7 @@ class Correlative(Matcher):
             prior,
             SearchEnd(pose, best.divided, True, is_ambiguous),
             Pairs(residual, weight),
-            mean_score_of(leaf)[0],
+            lattice.mean_score(leaf)[0],
             surface_information(surface(points), pose, weight),
             Limits(),
         )

@@ -105,7 +105,7 @@ class FieldMatcher(Matcher):
         length, lines = length_of(points), surface(points)
         low, high = _DAMPING[1:]
 
-        def unfinished(state: _State) -> Array:
+        def goes_on(state: _State) -> Array:
             return jnp.asarray((state[0] < self.iterations) & ~state[4])
 
         def onto_of(pose: Array, at: _Linearization) -> Array:
@@ -154,7 +154,7 @@ class FieldMatcher(Matcher):
             jnp.asarray(_DAMPING[0], start.dtype),
             jnp.zeros((), bool),
         )
-        k, pose, at, _, small = jax.lax.while_loop(unfinished, step, first)
+        k, pose, at, _, small = jax.lax.while_loop(goes_on, step, first)
         pairs = Pairs(at.residual, at.weight)
         return make_match(
             points,

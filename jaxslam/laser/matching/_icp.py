@@ -16,8 +16,8 @@ from jaxslam.graphs._solver.kernels import Kernel
 from jaxslam.laser.matching._closed_form import (
     Quadratic,
     add,
-    linearized,
     minimizer,
+    normal_equations,
     of_lines,
     of_points,
     of_prior,
@@ -111,7 +111,7 @@ class Icp(Matcher):
         """The residual [m] between each point of a scan and its partner."""
         raise NotImplementedError
 
-    def usable(self, of: Surface) -> Bool[Array, "M"]:
+    def usable_points(self, of: Surface) -> Bool[Array, "M"]:
         """The mask of the points of the reference that may be partners."""
         return jnp.ones_like(of.straight)
 
@@ -145,7 +145,7 @@ class Icp(Matcher):
             # the middle.
             arm = middle - pose[:2]
             to_middle = jnp.eye(3, dtype=pose.dtype).at[:2, 2].set(jnp.stack([-arm[1], arm[0]]))
-            curvature, slope = linearized(of)
+            curvature, slope = normal_equations(of)
             curvature, slope = to_middle.T @ curvature @ to_middle, to_middle.T @ slope
             terms = prior_terms(prior, pose)
             curvature, slope = fuse_prior(curvature, slope, terms, onto, length)
@@ -155,7 +155,7 @@ class Icp(Matcher):
         far = length + jnp.abs(start[:2]).max()
         tolerance = jnp.maximum(settings.tolerance, 8 * float(jnp.finfo(start.dtype).eps) * far)
 
-        def unfinished(state: _State) -> Array:
+        def goes_on(state: _State) -> Array:
             k, _, _, change = state
             return jnp.asarray((k < settings.iterations) & (change > tolerance))
 
@@ -188,7 +188,7 @@ class Icp(Matcher):
         # No pose before the first: infinitely far away, with an angle that can be wrapped.
         before = jnp.full(3, jnp.inf, start.dtype).at[2].set(0.0)
         first = jnp.zeros((), jnp.int32), start, before, jnp.asarray(jnp.inf, start.dtype)
-        k, pose, _, change = jax.lax.while_loop(unfinished, step, first)
+        k, pose, _, change = jax.lax.while_loop(goes_on, step, first)
         at = icp._pairs(prepared, points, pose)
         pairs = Pairs(at.residual, at.weight, at.partner)
         return make_match(
@@ -216,7 +216,7 @@ class Icp(Matcher):
         moved = points.position @ se2.rotation(pose[2]).T + pose[None, :2]
         partner = nearest_points(of.position, moved)
         distance = ((moved - of.position[partner]) ** 2).sum(axis=1)
-        possible = points.valid & (distance < settings.reach**2) & self.usable(of)[partner]
+        possible = points.valid & (distance < settings.reach**2) & self.usable_points(of)[partner]
         residual = jnp.where(possible, self.residual(of, moved, partner), 0.0)
         weight = weights(residual, possible, settings.kernel, settings.scale, settings.trim)
         return _PairedPoints(moved, partner, residual, weight)
@@ -301,8 +301,8 @@ class PointToLine(Icp):
             return across
         return jnp.where(of.straight[partner], across, lone * distance(of, moved, partner))
 
-    def usable(self, of: Surface) -> Bool[Array, "M"]:
-        return of.straight if self.settings.lone is None else super().usable(of)
+    def usable_points(self, of: Surface) -> Bool[Array, "M"]:
+        return of.straight if self.settings.lone is None else super().usable_points(of)
 
     def quadratic(self, of: Surface, pairs: _PairedPoints, middle: Array) -> Quadratic:
         j, lone = pairs.partner, self.settings.lone

@@ -17,7 +17,7 @@ from jaxslam.core.validation import Check, InvalidField, instance_of, refusals_o
 from jaxslam.laser.grids._grid import Grid, grid_map
 from jaxslam.laser.matching._point_sets import Points, Prior
 from jaxslam.math._arrays import in_dtype
-from jaxslam.math._definite import asymmetric, indefinite
+from jaxslam.math._definite import is_asymmetric, is_indefinite
 
 Reference: TypeAlias = Points | Grid
 
@@ -147,7 +147,7 @@ def match(
                 if not (np.all(np.isfinite(mean)) and np.all(np.isfinite(information))):
                     raise InvalidField("prior", "expected finite numbers")
                 # 1e-4: the inverse of a covariance in float32 may have few digits.
-                if asymmetric(information, 1e-4).any() or indefinite(information, 1e-4).any():
+                if is_asymmetric(information, 1e-4).any() or is_indefinite(information, 1e-4).any():
                     reason = "expected a symmetric information, positive semi-definite"
                     raise InvalidField("prior", reason)
     with jax.numpy_dtype_promotion("standard"):  # the user may have refused promotion: "strict"

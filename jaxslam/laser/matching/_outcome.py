@@ -36,7 +36,7 @@ class Pairs(NamedTuple):
 
 
 class SearchEnd(NamedTuple):
-    """Where a search ended, and how."""
+    """The end of a search: its pose, and whether it converged."""
 
     pose: Float[Array, "3"]
     iterations: Int[Array, ""]

@@ -22,7 +22,7 @@ def total(terms: Iterable[jax.Array]) -> jax.Array:
     return functools.reduce(operator.add, terms)
 
 
-def kept_whole(function: Callable[..., _T]) -> Callable[..., _T]:
+def rematerialize(function: Callable[..., _T]) -> Callable[..., _T]:
     """The function, rematerialized in reverse mode: only its arguments are stored.
 
     Unrolled code would otherwise store one array of the whole loop for each entry.
@@ -39,7 +39,7 @@ def gram(a: Float[Array, "k D"], b: Float[Array, "k E"]) -> Float[Array, "D E"]:
     return _outer_products(a, b)
 
 
-@kept_whole
+@rematerialize
 def _outer_products(a: Float[Array, "k D"], b: Float[Array, "k E"]) -> Float[Array, "D E"]:
     return total(a[k, :, None] * b[k, None, :] for k in range(a.shape[0]))
 

@@ -27,7 +27,7 @@ except (ValueError, OSError, locale.Error):
 
 from jaxslam._public import publish
 from jaxslam.results.plot._check_figure import check_figure
-from jaxslam.results.plot._film import Film, Layer, Panel, Scene
+from jaxslam.results.plot._film import Film, stage
 from jaxslam.results.plot._graph_figures import graph_figure
 from jaxslam.results.plot._grid_figures import (
     grid_figure,
@@ -75,9 +75,6 @@ __all__ = [
     "TEXT",
     "Figure",
     "Film",
-    "Layer",
-    "Panel",
-    "Scene",
     "animate",
     "animate_world",
     "band",
@@ -101,6 +98,7 @@ __all__ = [
     "probe",
     "recording_figure",
     "rmse_figure",
+    "stage",
     "titled",
     "topology_figure",
     "walls_figure",

@@ -12,7 +12,7 @@ from jaxslam.core.validation import InvalidField, refusals_of
 from jaxslam.graphs import Factor, Graph
 from jaxslam.graphs._graph import is_successive
 from jaxslam.graphs._solver.model import factors_of
-from jaxslam.results.plot._film import Layer, Panel, Scene, lines_between, marks, still
+from jaxslam.results.plot._film import Film, joined, stage
 from jaxslam.results.plot._style import (
     COLORS,
     FAINT,
@@ -126,7 +126,8 @@ def _edges(graph: Graph, factors: Mapping[str, Factor]) -> dict[str, Float[np.nd
     return {name: np.concatenate(parts) for name, parts in ends_by_name.items()}
 
 
-def graph_scene(
+@own_settings()
+def graph_film(
     iterates: Sequence[Graph],
     chi2: Sequence[float],
     *,
@@ -134,8 +135,8 @@ def graph_scene(
     factors: Mapping[str, Factor] | None = None,
     title: str = "",
     note: str = "",
-) -> Scene:
-    """The scene of one graph at each of F iterates: path, loop edges, points, and χ² as text.
+) -> Film:
+    """The film of one graph at each of F iterates: path, loop edges, points, and χ² as text.
 
     The last iterate stays in the background. Edges between poses of successive ids are the
     path, others are loop edges.
@@ -152,28 +153,13 @@ def graph_scene(
         raise InvalidField(
             "",
             f"expected as many χ² as iterates, at least 1, got {len(chi2)} and {len(iterates)}",
-            owner="graph_scene",
+            owner="graph_film",
         )
-    with refusals_of("graph_scene"):
+    with refusals_of("graph_film"):
         factors = factors_of(iterates[0], factors)
     poses = np.stack([np.asarray(graph.poses)[:, :2] for graph in iterates])
     points = np.stack([np.asarray(graph.points)[:, :2] for graph in iterates])
     edges = [_edges(graph, factors) for graph in iterates]
-    layers: list[Layer] = [still(poses[-1], color=SHADE, lw=2.5, label="path at the end", zorder=1)]
-    for name, look in _EDGES.items():
-        if len(edges[0][name]):
-            layers.append(lines_between([ends[name] for ends in edges], label=name, **look))
-    if points.shape[1]:
-        dots: Look = {"marker": ".", "ms": 3, "color": COLORS[2], "label": "points", "zorder": 4}
-        layers.append(marks(points, np.ones(points.shape[:2], bool), **dots))
-    first: Look = {"marker": "o", "ms": 5, "mec": INK, "mfc": "white", "label": "first pose"}
-    layers.append(marks(poses[:, :1], np.ones((len(poses), 1), bool), **first))
-
-    def caption(k: int) -> str:
-        step = k if steps is None else steps[k]
-        when = f"iteration {step}" if step else "start"
-        return f"{when}, χ² = {chi2[k]:.6g}"
-
     # The limits hold the first and the last iterate, and of the others the bulk: a diverging
     # iterate leaves the panel.
     positions = np.concatenate([poses, points], axis=1)
@@ -182,4 +168,26 @@ def graph_scene(
     high = np.maximum(ends.max(axis=0), np.quantile(bulk, 0.99, axis=0))
     margin = 0.04 * max(float((high - low).max()), 1.0)
     x, y = ((float(a - margin), float(b + margin)) for a, b in zip(low, high, strict=True))
-    return Scene(len(iterates), Panel(layers, x, y), None, caption, title, note)
+    figure, (axes, _) = stage(x, y)
+    axes.plot(*poses[-1].T, color=SHADE, lw=2.5, label="path at the end", zorder=1)
+    lines = {
+        name: axes.plot([], [], label=name, **look)[0]
+        for name, look in _EDGES.items()
+        if len(edges[0][name])
+    }
+    look: Look = {"ls": "none", "marker": ".", "ms": 3, "color": COLORS[2], "zorder": 4}
+    label = "points" if points.shape[1] else "_"
+    (dots,) = axes.plot([], [], label=label, **look)
+    look = {"ls": "none", "marker": "o", "ms": 5, "mec": INK, "mfc": "white"}
+    (first,) = axes.plot([], [], label="first pose", **look)
+
+    def update(k: int) -> str:
+        for name, line in lines.items():
+            line.set_data(*joined(edges[k][name]).T)
+        dots.set_data(*points[k].T)
+        first.set_data(*poses[k, :1].T)
+        step = k if steps is None else steps[k]
+        when = f"iteration {step}" if step else "start"
+        return f"{when}, χ² = {chi2[k]:.6g}"
+
+    return Film(figure, update, len(iterates), title=title, note=note, fps=2.0)

@@ -4,11 +4,10 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float
-from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.colors import Colormap, LinearSegmentedColormap, ListedColormap
 from matplotlib.figure import Figure
-from matplotlib.patches import Patch
+from matplotlib.patches import Patch, Polygon
 from numpy.typing import ArrayLike
 
 from jaxslam.consistency.metrics import ate
@@ -19,7 +18,7 @@ from jaxslam.laser.grids import Field, Grid
 from jaxslam.laser.laser_slam import LoopOutcome, Solved
 from jaxslam.laser.topology import Route, TopologicalMap
 from jaxslam.laser.topology._places import cell_centers
-from jaxslam.results.plot._film import Draw, Layer, Panel, Scene, line_of, triangle
+from jaxslam.results.plot._film import Film, robot_at, stage
 from jaxslam.results.plot._style import (
     COLORS,
     FAINT,
@@ -292,7 +291,8 @@ def _shade(log_odds: np.ndarray, block: int) -> np.ndarray:
     return np.where(odds == 0, 0.8, 0.5 * (1 - np.tanh(0.5 * odds)))
 
 
-def map_scene(
+@own_settings()
+def map_film(
     log_odds: Sequence[Float[np.ndarray, "H W"]],
     origin: Float[np.ndarray, "3"],
     resolution: float,
@@ -300,8 +300,8 @@ def map_scene(
     captions: Sequence[str],
     *,
     title: str = "",
-) -> Scene:
-    """The scene of F maps of one frame, each with the path that made it; the robot is at its end.
+) -> Film:
+    """The film of F maps of one frame, each with the path that made it; the robot is at its end.
 
     Args:
         log_odds: cells of each map; 0 is unknown.
@@ -313,7 +313,7 @@ def map_scene(
         ValueError: without maps, other numbers of paths or captions, or a rotated frame.
     """
     count = len(log_odds)
-    with refusals_of("map_scene"):
+    with refusals_of("map_film"):
         if not count or {count} != {len(paths), len(captions)}:
             raise InvalidField(
                 "",
@@ -325,24 +325,27 @@ def map_scene(
     height, width = log_odds[0].shape
     x = float(origin[0]), float(origin[0] + resolution * width)
     y = float(origin[1]), float(origin[1] + resolution * height)
-    ends = np.stack([path[-1] for path in paths])
     size = 0.03 * max(x[1] - x[0], y[1] - y[0])
-    robot = triangle(ends, size, fc=COLORS[0], ec="white", lw=0.6, zorder=5)
-    path = line_of(lambda k: paths[k][:, :2], color=COLORS[0], lw=1.0, label="path", zorder=3)
+    figure, (axes, _) = stage(x, y)
+    axes.grid(visible=False)
+    cells = axes.imshow(
+        shown_occupancy(log_odds[0]),
+        extent=(*x, *y),
+        origin="lower",
+        interpolation="nearest",
+        zorder=1,
+        cmap=shades_of_occupancy(),
+        vmin=0,
+        vmax=1,
+    )
+    (line,) = axes.plot([], [], color=COLORS[0], lw=1.0, label="path", zorder=3)
+    robot = Polygon(np.zeros((3, 2)), closed=True, fc=COLORS[0], ec="white", lw=0.6, zorder=5)
+    axes.add_patch(robot)
 
-    def image(axes: Axes) -> Draw:
-        axes.grid(visible=False)
-        cells = axes.imshow(
-            shown_occupancy(log_odds[0]),
-            extent=(*x, *y),
-            origin="lower",
-            interpolation="nearest",
-            zorder=1,
-            cmap=shades_of_occupancy(),
-            vmin=0,
-            vmax=1,
-        )
-        return lambda k: cells.set_data(shown_occupancy(log_odds[k]))
+    def update(k: int) -> str:
+        cells.set_data(shown_occupancy(log_odds[k]))
+        line.set_data(*paths[k][:, :2].T)
+        robot.set_xy(robot_at(paths[k][-1], size))
+        return captions[k]
 
-    layers: list[Layer] = [image, path, robot]
-    return Scene(count, Panel(layers, x, y), None, lambda k: captions[k], title)
+    return Film(figure, update, count, title=title)

@@ -55,7 +55,8 @@ def recording_figure(scores: RecordingScores, *, title: str = "", width: float =
         axes.plot(time, error[:, k], color=COLORS[1], lw=0.9, label="truth - estimate", gid=CURVE)
         axes.axhline(0.0, color=INK, lw=0.6)
         sizes = [np.nanquantile(np.abs(error[:, k]), 0.99)]
-        sizes += [np.nanquantile(bound[:, k], 0.99)] * is_claimed
+        if is_claimed:
+            sizes.append(np.nanquantile(bound[:, k], 0.99))
         top = _HEIGHT * max(sizes) or 1.0
         axes.set_ylim(-top, top)
         ordinate(axes, f"{name} [{'°' if name == 'heading' else 'm'}]", 0.16 * width + 0.3)

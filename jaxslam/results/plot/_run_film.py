@@ -8,6 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Int, PyTree
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.colors import to_rgba
+from matplotlib.lines import Line2D
+from matplotlib.patches import Polygon
 from numpy.typing import ArrayLike
 
 from jaxslam._driver import run
@@ -21,25 +26,10 @@ from jaxslam.filters._information.marginals import local_information
 from jaxslam.filters._information.sparse_state import SparseState
 from jaxslam.filters._particles.pose_particles import PoseParticles
 from jaxslam.filters._particles.slam_particles import SlamParticles
-from jaxslam.results.plot._film import (
-    Film,
-    Layer,
-    Panel,
-    Scene,
-    cloud,
-    lines_between,
-    marks,
-    rings,
-    still,
-    track,
-    triangle,
-    weighted_segments,
-)
+from jaxslam.results.plot._film import Film, joined, robot_at, stage
 from jaxslam.results.plot._landmarks import Limits, ellipses, extent, square_limits
-from jaxslam.results.plot._style import COLORS, FAINT, INK, Look
+from jaxslam.results.plot._style import COLORS, FAINT, INK, Look, own_settings, titled
 from jaxslam.simulation._worlds import World, run_keys, with_positions, world_of_run
-
-_ROBOT_LINK, _LINK = COLORS[5], COLORS[3]
 
 _CUT_FOR = 8
 """Number of frames in which a link that was cut is still shown."""
@@ -113,64 +103,6 @@ def _links(omega: Float[Array, "D D"], size: int) -> Links:
     return Links(
         jnp.where(differ, norm / (diagonal[:, None] * diagonal[None, :]), 0.0).astype(jnp.float32)
     )
-
-
-def particle_layer(seen: Cloud, origin: np.ndarray, label: str) -> Layer:
-    """The layer of the positions of particles, from an origin (F, 2)."""
-    look: Look = {"color": COLORS[7], "lw": 0, "alpha": 0.6, "zorder": 5.1}
-    at = np.asarray(seen.pose)[..., :2] - origin[:, None]
-    return cloud(at, np.asarray(seen.weight), label=label, **look)
-
-
-def hypothesis_layers(seen: object) -> list[Layer]:
-    """The layers of points that may become landmarks; none where `seen` is not `Hypotheses`."""
-    if not isinstance(seen, Hypotheses):
-        return []
-    points, covs, persistence = map(np.asarray, seen)
-    shown = persistence > 0
-    ring: Look = {"color": COLORS[3], "lw": 0.9, "ls": (0, (2, 1.2)), "zorder": 3.8}
-    dots: Look = {"color": COLORS[3], "marker": "D", "mfc": "white", "ms": 3.5, "zorder": 3.9}
-    return [
-        rings(points, covs, shown, label="hypothesis, 3 σ", **ring),
-        marks(points, shown, label="_", **dots),
-    ]
-
-
-def link_layers(seen: object, estimate: Estimate) -> list[Layer]:
-    """The layers of the links of an information matrix, as wide as strong; recent cuts dotted.
-
-    None where `seen` is not `Links`. estimate: with leading F, as the links.
-    """
-    if not isinstance(seen, Links):
-        return []
-    strength = np.asarray(seen.strength)
-    strength = np.where(np.isfinite(strength) & (strength > _WEAK), strength, 0.0)
-    between: list[np.ndarray] = []
-    robot: list[np.ndarray] = []
-    cut: list[np.ndarray] = []
-    weights: dict[str, list[np.ndarray]] = {"between": [], "robot": []}
-    for k, step in enumerate(strength):
-        nodes = np.concatenate([estimate.pose[k, None, :2], estimate.points[k]])
-        linked = np.triu(step > 0)
-        recent = np.triu(strength[max(0, k - _CUT_FOR) : k + 1].max(axis=0) > 0)
-        i, j = np.nonzero(linked)
-        ends, weight = nodes[np.stack([i, j], axis=1)], np.minimum(step[i, j], 1.0)
-        between.append(ends[i > 0])
-        robot.append(ends[i == 0])
-        weights["between"].append(weight[i > 0])
-        weights["robot"].append(np.maximum(weight[i == 0], _MIN_STRENGTH))
-        alive = np.append(True, estimate.alive[k])
-        gone = recent & ~linked & alive[:, None] & alive[None, :]
-        cut.append(nodes[np.stack(np.nonzero(gone), axis=1)])
-    look: Look = {"capstyle": "round", "zorder": 2.6}
-    dots: Look = {"color": INK, "lw": 1.0, "ls": (0, (1, 1.2)), "zorder": 2.8}
-    landmarks: Look = look | {"width": 3.0, "label": "link of landmarks"}
-    robots: Look = look | {"width": 5.0, "label": "link to the robot"}
-    return [
-        weighted_segments(between, weights["between"], color=_LINK, **landmarks),
-        weighted_segments(robot, weights["robot"], color=_ROBOT_LINK, **robots),
-        *([lines_between(cut, label="link cut", **dots)] if any(map(len, cut)) else []),
-    ]
 
 
 MOST = 100
@@ -247,15 +179,6 @@ def history_of(trace: Trace, log: Log, frames: int = MOST) -> History:
     return History(path, steps, estimate, tag, status, slot, seen)
 
 
-class FrameBeams(NamedTuple):
-    """The measurements since the previous frame, for each of F frames."""
-
-    beams: dict[str, list[Float[np.ndarray, "E 2 2"]]]
-    """ends by outcome: the robot, and the landmark if it is in the map"""
-    counts: dict[str, Int[np.ndarray, "F"]]
-    """number of measurements, by outcome"""
-
-
 _OUTCOMES = {
     "fused": (Status.FUSED,),
     "new": (Status.BORN,),
@@ -264,11 +187,12 @@ _OUTCOMES = {
 }
 
 
-def beams_of(history: History) -> FrameBeams:
-    """The beams and counts of a history.
+def beams_of(history: History) -> tuple[dict[str, list[np.ndarray]], dict[str, list[int]]]:
+    """By outcome: the ends (E, 2, 2) of the beams since the previous frame, and their numbers.
 
     A beam begins where the robot was estimated in that step, and ends at the landmark's estimate in
-    the frame. A dropped measurement has the landmark of its tag, if that is in the map.
+    the frame. A dropped measurement has the landmark of its tag; one of no landmark in the map is
+    counted, without a beam.
     """
     beams: dict[str, list[np.ndarray]] = {name: [] for name in _OUTCOMES}
     counts: dict[str, list[int]] = {name: [] for name in _OUTCOMES}
@@ -291,7 +215,7 @@ def beams_of(history: History) -> FrameBeams:
             row, place = np.nonzero(chosen & in_map)
             ends = [history.path[rows][row, :2], np.asarray(points)[target[row, place]]]
             beams[name].append(np.stack(ends, axis=1))
-    return FrameBeams(beams, {name: np.array(numbers) for name, numbers in counts.items()})
+    return beams, counts
 
 
 _NEAR = 1.5
@@ -311,15 +235,19 @@ _BEAMS: dict[str, Look] = {
 }
 """Beams by outcome of the measurement; dashes differ, for readers without colour."""
 
+_RING: Look = {"color": COLORS[0], "lw": 1.0, "ls": (0, (3, 1))}
+"""The ellipse of the robot."""
 
-def run_scene(
+
+@own_settings()
+def run_film(
     history: History,
     *,
     true_points: np.ndarray | None = None,
     true_path: np.ndarray | None = None,
     title: str = "",
-) -> Scene:
-    """The scene of a run: robot, beams, landmarks with 3 σ ellipses, and the truth in grey.
+) -> Film:
+    """The film of a run: robot, beams, landmarks with 3 σ ellipses, and the truth in grey.
 
     A history with particles, links or hypotheses shows these, too. Beside the map is the error of
     the robot's position within its ellipse, on a fixed scale. The limits are those of the truth, or
@@ -341,30 +269,123 @@ def run_scene(
             f"animate: expected a true path of shape ({steps}, 3), got {np.shape(true_path)}"
         )
     true = None if true_path is None else np.asarray(true_path, float)
-    beams = beams_of(history)
+    pose, pose_cov, points, covs, alive, _ = map(np.asarray, history.estimate)
+    pose_cov = pose_cov[:, :2, :2]
+    beams, counts = beams_of(history)
+    without = (np.isnan(ellipses(m[a], c[a])) for m, c, a in zip(points, covs, alive, strict=True))
+    lost = [int(of.all(axis=(1, 2)).sum()) for of in without]
+    half, error = _scale_of_errors(history, true)
+    is_known = np.isfinite(error).all(axis=1)
+    beyond = is_known & (np.abs(error).max(axis=1) > half)
     limits = _limits(history, true_points, true)
-    side = limits[0][1] - limits[0][0]
-    layers = [
-        *_truth(history, true_points, true, _ROBOT * side),
-        *link_layers(history.seen, history.estimate),
-        *(
-            lines_between(beams.beams[name], label=f"measured, {name}", zorder=3, **look)
-            for name, look in _BEAMS.items()
-            if any(map(len, beams.beams[name]))
-        ),
-        *hypothesis_layers(history.seen),
-        *_map(history),
-        *_robot(history, _ROBOT * side),
-    ]
-    return Scene(
-        len(history.step),
-        Panel(layers, *limits),
-        _error_panel(history, true),
-        _text(history, beams),
-        title,
-        f"{len(history.step):,} of {steps:,} steps are shown, evenly in time"
-        * (len(history.step) < steps),
-    )
+    size, seen, count = _ROBOT * (limits[0][1] - limits[0][0]), history.seen, len(history.step)
+    figure, (main, beside) = stage(*limits, beside=half)
+    titled(beside, "about the estimated position" if true is None else "robot: truth − estimate")
+    lines: dict[Line2D, Callable[[int], np.ndarray]] = {}
+    robots: dict[Polygon, np.ndarray] = {}
+
+    def line(of: Callable[[int], np.ndarray], axes: Axes = main, **look: Any) -> None:
+        """A line through of(k) (N, 2) in frame k."""
+        lines[axes.plot([], [], **look)[0]] = of
+
+    def robot(poses: np.ndarray, **look: Any) -> None:
+        patch = Polygon(np.zeros((3, 2)), closed=True, **look)
+        robots[patch] = poses
+        main.add_patch(patch)
+
+    def rings(of: Callable[[int], tuple[np.ndarray, np.ndarray]], **look: Any) -> None:
+        """3 σ ellipses of means and covariances; indefinite ones are left out."""
+        line(lambda k: joined(ellipses(*of(k), points=48)), **look)
+
+    dots: Look = {"ls": "none", "label": "_"}
+    if true_points is not None:
+        look: Look = {"color": FAINT, "ms": 5, "mew": 1.0, "zorder": 2}
+        main.plot(*true_points.T, "x", label="true landmarks", **look)
+    if true is not None:
+        look = {"color": FAINT, "lw": 1.2, "ls": (0, (4, 2)), "zorder": 2.1}
+        line(lambda k: true[: history.step[k] + 1, :2], label="truth: path, robot", **look)
+        robot(true[history.step], fc="none", ec=FAINT, lw=1.2, zorder=5.5)
+    links = {}
+    if isinstance(seen, Links):
+        ends, strength, cut = _links_of(seen, history.estimate)
+        for name, (color, width) in _LINKS.items():
+            look = {"color": color, "linewidth": width, "capstyle": "round", "zorder": 2.6}
+            links[name] = LineCollection([], label=name, **look)
+            main.add_collection(links[name], autolim=False)
+        if any(map(len, cut)):
+            look = {"color": INK, "lw": 1.0, "ls": (0, (1, 1.2)), "zorder": 2.8}
+            line(lambda k: joined(cut[k]), label="link cut", **look)
+    for name, look in _BEAMS.items():
+        if any(map(len, beams[name])):
+            ends_of = list(map(joined, beams[name]))
+            line(ends_of.__getitem__, label=f"measured, {name}", zorder=3, **look)
+    if isinstance(seen, Hypotheses):
+        guesses = [np.asarray(seen.persistence[k]) > 0 for k in range(count)]
+        look = {"color": COLORS[3], "lw": 0.9, "ls": (0, (2, 1.2)), "zorder": 3.8}
+        at, wide = np.asarray(seen.points), np.asarray(seen.covs)
+        guess = lambda k: (at[k][guesses[k]], wide[k][guesses[k]])  # noqa: E731
+        rings(guess, label="hypothesis, 3 σ", **look)
+        look = {"color": COLORS[3], "marker": "D", "mfc": "white", "ms": 3.5, "zorder": 3.9}
+        line(lambda k: at[k][guesses[k]], **dots | look)
+    if np.any(alive):
+        mark = 3.2 if points.shape[1] <= _MANY else 1.8
+        look = {"color": COLORS[1], "marker": "o", "ms": mark, "zorder": 4.1}
+        line(lambda k: points[k][alive[k]], **dots | look)
+        look = {"color": COLORS[1], "lw": 1.0, "zorder": 4, "label": "landmark, 3 σ"}
+        rings(lambda k: (points[k][alive[k]], covs[k][alive[k]]), **look)
+    look = {"color": COLORS[0], "lw": 1.4, "zorder": 3.5, "label": "estimate: path, robot"}
+    line(lambda k: history.path[: history.step[k] + 1, :2], **look)
+    clouds = []
+    if isinstance(seen, Cloud):
+        look = {"color": COLORS[7], "lw": 0, "alpha": 0.6, "zorder": 5.1}
+        weight, particles = np.asarray(seen.weight), np.asarray(seen.pose)[..., :2]
+        for axes, label, origin in ((main, "particles", 0 * pose), (beside, "_", pose)):
+            scatter = axes.scatter([], [], label=label, **look)
+            clouds.append((scatter, particles - origin[:, None, :2]))
+    robot(pose, fc=COLORS[0], ec="white", lw=0.6, zorder=5)
+    rings(lambda k: (pose[k, None, :2], pose_cov[k, None]), label="_", zorder=5.2, **_RING)
+    center = np.zeros((1, 2))
+    look = _RING | {"axes": beside, "label": "robot, 3 σ", "zorder": 4}
+    rings(lambda k: (center, pose_cov[k, None]), **look)
+    look = {"color": COLORS[0], "marker": "+", "ms": 7, "mew": 1.2, "zorder": 5}
+    line(lambda k: center, beside, **dots | look)
+    look = dots | {"color": INK, "marker": "X", "ms": 6.5, "zorder": 6, "clip_on": False}
+    if true is not None:
+        near = is_known & ~beyond
+        line(lambda k: error[k, None][: int(near[k])], beside, **look | {"label": "true position"})
+    if beyond.any():
+        look |= {"label": "true position beyond", "mfc": "white"}
+        line(lambda k: np.clip(error[k, None], -half, half)[: int(beyond[k])], beside, **look)
+
+    def update(k: int) -> str:
+        for artist, of in lines.items():
+            artist.set_data(*of(k).T)
+        for patch, poses in robots.items():
+            patch.set_xy(robot_at(poses[k], size))
+            patch.set_visible(bool(np.isfinite(poses[k]).all()))
+        for scatter, places in clouds:
+            shown = weight[k] > 0
+            scatter.set_offsets(places[k][shown])
+            scatter.set_sizes(np.clip(4.0 * weight[k][shown] * len(shown), 0.5, 60.0))
+        for name, collection in links.items():
+            heavy, (color, width) = np.sqrt(strength[name][k]), _LINKS[name]
+            collection.set_segments(list(ends[name][k]))
+            collection.set_linewidth(list(width * (0.15 + 0.85 * heavy)))
+            collection.set_color([to_rgba(color, 0.2 + 0.6 * value) for value in heavy])
+        numbers = {name: of[k] for name, of in counts.items() if of[k] or name != "stored"}
+        total = sum(numbers.values())
+        outcomes = ", ".join(f"{number} {name}" for name, number in numbers.items())
+        parts = [f"step {history.step[k] + 1:,} of {steps:,}"]
+        parts.append(f"{total} measurement{'s' * (total != 1)}: {outcomes}")
+        if isinstance(seen, Hypotheses):
+            number = guesses[k].sum()
+            parts.append(f"{number} hypothes{'is' if number == 1 else 'es'}")
+        parts += [f"{lost[k]} without ellipse"] if lost[k] else []
+        parts += [] if np.isfinite(pose[k]).all() else ["pose not finite"]
+        return " · ".join(parts)
+
+    note = f"{count:,} of {steps:,} steps are shown, evenly in time" * (count < steps)
+    return Film(figure, update, count, title=title, note=note)
 
 
 def _limits(history: History, points: np.ndarray | None, path: np.ndarray | None) -> Limits:
@@ -382,115 +403,50 @@ def _limits(history: History, points: np.ndarray | None, path: np.ndarray | None
     return square_limits(clouds)
 
 
-def _truth(
-    history: History, points: np.ndarray | None, path: np.ndarray | None, size: float
-) -> list[Layer]:
-    """The layers of the true map, path and robot, in grey."""
-    layers = []
-    if points is not None:
-        look: Look = {"ls": "none", "marker": "x", "ms": 5, "mew": 1.0, "zorder": 2}
-        layers.append(still(points, color=FAINT, label="true landmarks", **look))
-    if path is not None:
-        line: Look = {"lw": 1.2, "ls": (0, (4, 2)), "zorder": 2.1}
-        named = "truth: path, robot"
-        layers.append(track(path, history.step, color=FAINT, label=named, **line))
-        robot: Look = {"fc": "none", "ec": FAINT, "lw": 1.2, "zorder": 5.5}
-        layers.append(triangle(path[history.step], size, **robot))
-    return layers
-
-
-def _map(history: History) -> list[Layer]:
-    """The layers of the landmarks with their ellipses; none for a filter without a map."""
-    _, _, points, covs, alive, _ = map(np.asarray, history.estimate)
-    if not np.any(alive):
-        return []
-    ring: Look = {"color": COLORS[1], "lw": 1.0, "zorder": 4}
-    size = 3.2 if points.shape[1] <= _MANY else 1.8
-    dots: Look = {"color": COLORS[1], "marker": "o", "ms": size, "zorder": 4.1}
-    return [
-        marks(points, alive, label="_", **dots),
-        rings(points, covs, alive, label="landmark, 3 σ", **ring),
-    ]
-
-
-def _robot(history: History, size: float) -> list[Layer]:
-    """The layers of the path so far, particles, the robot's ellipse, and the robot."""
+def _scale_of_errors(history: History, path: np.ndarray | None) -> tuple[float, np.ndarray]:
+    """Half of the side of the panel of errors, and truth less estimate (F, 2); NaN if not known."""
     pose, cov = (np.asarray(part) for part in history.estimate[:2])
-    line: Look = {"color": COLORS[0], "lw": 1.4, "zorder": 3.5}
-    ring: Look = {"color": COLORS[0], "lw": 1.0, "ls": (0, (3, 1)), "zorder": 5.2}
-    robot: Look = {"fc": COLORS[0], "ec": "white", "lw": 0.6, "zorder": 5}
-    layers = [track(history.path, history.step, label="estimate: path, robot", **line)]
-    if isinstance(history.seen, Cloud):
-        layers.append(particle_layer(history.seen, np.zeros((len(pose), 2)), "particles"))
-    always = np.ones((len(pose), 1), bool)
-    return [
-        *layers,
-        triangle(pose, size, **robot),
-        rings(pose[:, None, :2], cov[:, None, :2, :2], always, label="_", **ring),
-    ]
-
-
-def _error_panel(history: History, path: np.ndarray | None) -> Panel:
-    """The robot's position as seen from its estimate: the ellipse, the truth, particles."""
-    pose, cov = (np.asarray(part) for part in history.estimate[:2])
-    cov = cov[:, None, :2, :2]
-    center, always = np.zeros((len(pose), 1, 2)), np.ones((len(pose), 1), bool)
-    contours = ellipses(center[:, 0], cov[:, 0])
+    contours = ellipses(np.zeros((len(pose), 2)), cov[:, :2, :2])
     reach = np.abs(contours[np.isfinite(contours)]).max(initial=0.0)
-    ring: Look = {"color": COLORS[0], "lw": 1.0, "ls": (0, (3, 1)), "zorder": 4}
-    layers = [rings(center, cov, always, label="robot, 3 σ", **ring)]
-    dot: Look = {"color": COLORS[0], "marker": "+", "ms": 7, "mew": 1.2, "zorder": 5}
-    layers.append(marks(center, always, label="_", **dot))
     if isinstance(history.seen, Cloud):
-        layers.insert(0, particle_layer(history.seen, pose[:, :2], "_"))
         spread = np.abs(np.asarray(history.seen.pose)[..., :2] - pose[:, None, :2])
-        spread = np.append(spread[np.isfinite(spread)], 0.0)
-        reach = max(reach, float(np.quantile(spread, 0.995)))
+        reach = max(reach, float(np.quantile(np.append(spread[np.isfinite(spread)], 0.0), 0.995)))
+    error = np.full((len(pose), 2), np.nan)
     if path is not None:
-        error = path[history.step, None, :2] - pose[:, None, :2]
-        is_known = np.isfinite(error).all(axis=2)
-        largest = np.abs(error[is_known]).max(initial=0.0)
+        error = path[history.step, :2] - pose[:, :2]
+        largest = np.abs(error[np.isfinite(error).all(axis=1)]).max(initial=0.0)
         # Errors up to three times the ellipses are on the scale, larger ones at its edge.
         reach = max(reach, min(largest, 3 * reach) if reach > 0 else largest)
-        half = 1.08 * reach or 1.0
-        beyond = is_known & (np.abs(error).max(axis=2) > half)
-        cross: Look = {"marker": "X", "ms": 6.5, "zorder": 6, "clip_on": False}
-        layers.append(marks(error, is_known & ~beyond, label="true position", color=INK, **cross))
-        if beyond.any():
-            edge = np.clip(error, -half, half)
-            look: Look = {"label": "true position beyond", "mfc": "white", "mec": INK}
-            layers.append(marks(edge, beyond, **look, **cross))
-    half = 1.08 * reach or 1.0
-    return Panel(
-        layers,
-        (-half, half),
-        (-half, half),
-        title="about the estimated position" if path is None else "robot: truth − estimate",
-    )
+    return 1.08 * float(reach) or 1.0, error
 
 
-def _text(history: History, beams: FrameBeams) -> Callable[[int], str]:
-    """The line above frame k: its step, and the outcomes of the measurements since frame k - 1."""
-    total = len(history.path)
-    lost = []
-    for covs, alive in zip(history.estimate.point_covs, history.estimate.alive, strict=True):
-        contours = ellipses(np.zeros((alive.sum(), 2)), covs[alive], points=1)
-        lost.append(int(np.isnan(contours).all(axis=(1, 2)).sum()))
+_LINKS = {"link of landmarks": (COLORS[3], 3.0), "link to the robot": (COLORS[5], 5.0)}
+"""Colour of the links of an information matrix, and their width at strength 1 [pt]; light ones are
+thin and pale."""
 
-    def caption(k: int) -> str:
-        counts = {name: int(numbers[k]) for name, numbers in beams.counts.items()}
-        shown = [f"{count} {name}" for name, count in counts.items() if count or name != "stored"]
-        parts = [f"step {history.step[k] + 1:,} of {total:,}"]
-        measured = sum(counts.values())
-        parts.append(f"{measured} measurement{'s' * (measured != 1)}: {', '.join(shown)}")
-        if isinstance(history.seen, Hypotheses):
-            count = int((np.asarray(history.seen.persistence[k]) > 0).sum())
-            parts.append(f"{count} hypothes{'is' if count == 1 else 'es'}")
-        parts += [f"{lost[k]} without ellipse"] if lost[k] else []
-        parts += [] if np.isfinite(history.estimate.pose[k]).all() else ["pose not finite"]
-        return " · ".join(parts)
 
-    return caption
+def _links_of(
+    seen: Links, estimate: Estimate
+) -> tuple[dict[str, list[np.ndarray]], dict[str, list[np.ndarray]], list[np.ndarray]]:
+    """Ends (E, 2, 2) of the links of each frame and their strengths, by kind, and recent cuts."""
+    strength = np.asarray(seen.strength)
+    strength = np.where(np.isfinite(strength) & (strength > _WEAK), strength, 0.0)
+    ends: dict[str, list[np.ndarray]] = {name: [] for name in _LINKS}
+    strengths: dict[str, list[np.ndarray]] = {name: [] for name in _LINKS}
+    cut = []
+    for k, step in enumerate(strength):
+        nodes = np.concatenate([estimate.pose[k, None, :2], estimate.points[k]])
+        linked = np.triu(step > 0)
+        i, j = np.nonzero(linked)
+        segments, weight = nodes[np.stack([i, j], axis=1)], np.minimum(step[i, j], 1.0)
+        for name, chosen, least in zip(_LINKS, (i > 0, i == 0), (0.0, _MIN_STRENGTH), strict=True):
+            ends[name].append(segments[chosen])
+            strengths[name].append(np.maximum(weight[chosen], least))
+        recent = np.triu(strength[max(0, k - _CUT_FOR) : k + 1].max(axis=0) > 0)
+        alive = np.append(True, estimate.alive[k])
+        gone = recent & ~linked & alive[:, None] & alive[None, :]
+        cut.append(nodes[np.stack(np.nonzero(gone), axis=1)])
+    return ends, strengths, cut
 
 
 def animate(
@@ -512,7 +468,7 @@ def animate(
     With a trace of `run(…, probe=jaxslam.plot.probe)` it shows the particles of a particle filter,
     the links of an information filter, and the hypotheses of `DelayedSlam`. Of more than `frames`
     steps, `frames` are shown, evenly in time, each with the beams since the previous one, and
-    `film.scene.note` says so.
+    `film.note` says so.
 
     Args:
         trace: result of `run`, T steps.
@@ -529,13 +485,12 @@ def animate(
         with refusals_of("animate"):
             require("truth", truth, instance_of(Truth))
         true_points, true_path = np.asarray(truth.landmarks)[:, :2], truth.pose
-    scene = run_scene(
+    return run_film(
         history,
         true_points=None if true_points is None else np.asarray(true_points),
         true_path=None if true_path is None else np.asarray(true_path),
         title=title,
     )
-    return Film(scene)
 
 
 def animate_world(

@@ -69,10 +69,8 @@ def own_settings() -> Iterator[None]:
     A figure does not depend on the user's matplotlibrc: neither on LaTeX, nor on fonts, sizes, or
     decimal commas. The settings of the user are restored at the end.
     """
-    ffmpeg = matplotlib.rcParams["animation.ffmpeg_path"]  # where a program is, not how it looks
     with matplotlib.rc_context():
         matplotlib.rcdefaults()
-        matplotlib.rcParams["animation.ffmpeg_path"] = ffmpeg
         matplotlib.rcParams["pdf.fonttype"] = 42  # TrueType, which publishers require
         matplotlib.rcParams["svg.hashsalt"] = "jaxslam"  # reproducible names of parts
         yield

@@ -100,11 +100,12 @@ class Drawn(Own):
 
 @record
 class Rounded(Own):
-    """Takes poses about a point a hundred kilometres away."""
+    """Rounds poses as those a hundred kilometres away are."""
 
     def estimate(self, state):
         estimate = self.filter.estimate(state)
-        return estimate._replace(pose=(estimate.pose + 1e5) - 1e5)
+        unit = 1e5 * jnp.finfo(estimate.pose.dtype).eps
+        return estimate._replace(pose=unit * jnp.round(estimate.pose / unit))
 
 
 @record

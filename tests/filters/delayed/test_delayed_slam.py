@@ -594,17 +594,17 @@ def test_without_names_intersections_find_the_landmarks():
     (lambda: StoredMeasurements(capacity=0), "^StoredMeasurements: capacity"),
     (
         lambda: StoredMeasurements(spacing=-0.1),
-        "^StoredMeasurements: spacing: expected a number from 0 to inf",
+        "^StoredMeasurements: spacing: expected a finite number >= 0",
     ),
     (lambda: Hypotheses(capacity=0), "^Hypotheses: capacity"),
     (lambda: Hypotheses(patience=0.5), "^Hypotheses: patience"),
-    (lambda: Hypotheses(decay=-1), "^Hypotheses: decay: expected a number from 0 to inf"),
+    (lambda: Hypotheses(decay=-1), "^Hypotheses: decay: expected a finite number >= 0"),
     (lambda: Hypotheses(spread=np.nan), "^Hypotheses: spread: expected a number above 0"),
     (lambda: Hypotheses(same=0), "^Hypotheses: same: expected a number above 0"),
     (lambda: Hypotheses(distance="euclid"), "^Hypotheses: distance: expected .*, got 'euclid'"),
     (lambda: Promotion(per_scan=1.5), "^Promotion: per_scan"),
     (lambda: Promotion(persistence=0), "^Promotion: persistence: expected a number above 0"),
-    (lambda: Promotion(lead=-1), "^Promotion: lead: expected a number from 0 to inf"),
+    (lambda: Promotion(lead=-1), "^Promotion: lead: expected a finite number >= 0"),
 )
 def test_bad_arguments_are_refused(make):
     make()

@@ -17,10 +17,10 @@ from jaxslam.core.types import Scan, Status
 from jaxslam.filters import EkfSlam
 from jaxslam.filters._ekf.correction import correct
 from jaxslam.filters.map_management.relocalization import (
-    lost,
+    forget_pose,
     points_of_map,
     relocalize,
-    relocated,
+    replace_pose,
     seen_points,
 )
 from jaxslam.linearize import FirstEstimate
@@ -28,9 +28,9 @@ from jaxslam.math.stats import chi2_band, chi2_quantile
 
 SENSOR = sensors.RangeBearing(np.diag([0.05, 0.01]) ** 2, mount=(0.2, 0.1, 0.3))
 FIND, ALIGN = jax.jit(relocalize), jax.jit(se2.align)
-LOST = jax.jit(lost, static_argnums=1, static_argnames="square_root")
+LOST = jax.jit(forget_pose, static_argnums=1, static_argnames="square_root")
 MAP_OF = jax.jit(points_of_map, static_argnums=1, static_argnames="square_root")
-RELOCATED = jax.jit(relocated, static_argnums=1)
+RELOCATED = jax.jit(replace_pose, static_argnums=1)
 
 
 def world(seed, count, reach=10.0, spread=0.05):
@@ -328,7 +328,7 @@ def test_the_relocated_pose_is_honest():
         )
         exact = jax.vmap(se2.to_frame, (None, 0))(jnp.asarray(pose), jnp.asarray(points)[:4])
         covs = jnp.tile(0.05**2 * jnp.eye(2), (4, 1, 1))
-        after = relocated(state, chart, jnp.arange(4), exact + 0.05 * noise, covs)
+        after = replace_pose(state, chart, jnp.arange(4), exact + 0.05 * noise, covs)
         turn = jnp.arctan2(jnp.sin(after.pose[2] - pose[2]), jnp.cos(after.pose[2] - pose[2]))
         error = jnp.concatenate(
             [after.pose[:2] - pose[:2], turn[None], (after.landmarks - points).ravel()]
@@ -369,7 +369,7 @@ def test_a_kidnapped_robot_finds_itself_and_goes_on():
     predict, update = jax.jit(filter.predict), jax.jit(filter.update)
     look = jax.jit(jax.vmap(sensor.observe, (None, 0)))
     points_of = jax.jit(partial(seen_points, sensor))
-    again = jax.jit(lambda s, slot, scan: relocated(s, chart, slot, *seen_points(sensor, scan)))
+    again = jax.jit(lambda s, slot, scan: replace_pose(s, chart, slot, *seen_points(sensor, scan)))
     key = jax.random.key(0)
     pose, u = np.zeros(3), np.array([0.4, 0.0, 0.08])
     state, missing, events = filter.init(np.zeros(3), np.zeros((3, 3))), False, []
@@ -427,8 +427,11 @@ def former(joint):
     (lambda: relocalized(pairs=0), "pairs"),
     (lambda: relocalized(candidates=0), "candidates"),
     (lambda: relocalized(slice(4)), "shape"),
-    (lambda: lost(some_joint(), charts.Euclidean(), -np.eye(3)), "covariance"),
-    (lambda: lost(former(some_joint()), charts.Euclidean(), np.eye(3)), "keeps former estimates"),
+    (lambda: forget_pose(some_joint(), charts.Euclidean(), -np.eye(3)), "covariance"),
+    (
+        lambda: forget_pose(former(some_joint()), charts.Euclidean(), np.eye(3)),
+        "keeps former estimates",
+    ),
     (
         lambda: MAP_OF(some_joint()._replace(landmarks=np.zeros((4, 3))), charts.Euclidean()),
         "landm",
@@ -437,7 +440,7 @@ def former(joint):
         lambda: RELOCATED(
             some_joint(), charts.Euclidean(), np.arange(2), np.zeros((3, 2)), np.zeros((3, 2, 2))
         ),
-        r"relocated: seen: expected shape \(2, 2\), got \(3, 2\)",
+        r"replace_pose: seen: expected shape \(2, 2\), got \(3, 2\)",
     ),
     (
         lambda: seen_points(sensors.BearingOnly(0.1 * np.eye(1)), None),

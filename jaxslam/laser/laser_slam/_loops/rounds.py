@@ -228,7 +228,7 @@ def _judge(
     at: Float[np.ndarray, "N 3"],
     total: Float[np.ndarray, "N 3 3"],
 ) -> tuple[Loops, Bool[np.ndarray, "M"]]:
-    """All candidates with their outcome, and the mask of those kept: a clique that agrees.
+    """The candidates with their outcome, and the mask of the clique that agrees.
 
     `Loops.first` and `second` are rows of the graph.
 

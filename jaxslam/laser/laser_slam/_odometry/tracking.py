@@ -96,7 +96,7 @@ class Odometry(NamedTuple):
 
 
 class Mode(Enum):
-    """What a scan can be matched with, and from where."""
+    """The mode of the tracking: where the match of the next scan is searched for."""
 
     STARTING = "no keyframe has points yet"
     TRACKING = "raw odometry leads here from the last match: search about it"
@@ -110,7 +110,7 @@ class RelativeEstimate(NamedTuple):
     cov: Float[np.ndarray, "3 3"]
     """covariance of the end of the pose"""
 
-    def moved(
+    def move(
         self, step: Float[np.ndarray, "3"], cov: Float[np.ndarray, "3 3"]
     ) -> "RelativeEstimate":
         """The estimate after an independent step with the covariance of its end."""
@@ -233,8 +233,8 @@ def step(
     # Predict. Where raw odometry is frozen or set anew, the robot most likely goes on as it did.
     begin = track.at if track.before_lag is None else track.before_lag
     ahead = track.motion if raw.frozen or raw.reset else raw.step
-    predicted = begin.moved(ahead, raw.cov)
-    before_lag = begin.moved(ahead, raw.cov - reach_cov(raw.reach)) if raw.lags else None
+    predicted = begin.move(ahead, raw.cov)
+    before_lag = begin.move(ahead, raw.cov - reach_cov(raw.reach)) if raw.lags else None
 
     # Match, from the prediction and from what else is possible.
     fit = _NO_MATCH
@@ -328,7 +328,7 @@ def _alternative_of(
     | other | accepted | none |
     """
     if raw.jump and not raw.reset:
-        return begin.moved(raw.logged, raw.cov)
+        return begin.move(raw.logged, raw.cov)
     if not fit.accepted:
         return None
     if raw.frozen:
@@ -398,13 +398,13 @@ def _best_match(
     is_blind = mode is Mode.BLIND or bool(raw.lags)
     best = _match_about(track.reference, points, predicted, raw, is_blind, settings)
     if track.alternative is not None and not raw.unknown:
-        guess = track.alternative.moved(raw.step, raw.cov)
+        guess = track.alternative.move(raw.step, raw.cov)
         fit = _match_about(track.reference, points, guess, raw, is_blind, settings)
         if fit.accepted and fit.quality > best.quality:
             best = fit
     if raw.odd:
         cov = raw.cov + reach_cov(STEP_CHANGE * raw.usual_reach)
-        guess = begin.moved(track.motion, cov)
+        guess = begin.move(track.motion, cov)
         fit = _match_about(track.reference, points, guess, raw, True, settings)
         size = np.array([np.hypot(raw.step[0], raw.step[1]), abs(raw.step[2])])
         too_odd = (size > _TOO_ODD * raw.usual_reach).any()

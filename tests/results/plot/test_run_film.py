@@ -1,4 +1,4 @@
-"""Scenes: the numbers that artists have in each frame, what is refused, and that frames differ."""
+"""Films: the numbers that artists have in each frame, what is refused, and that frames differ."""
 
 import sys
 
@@ -12,7 +12,7 @@ import worlds
 import jaxslam
 from jaxslam import catalog, filters, motion, plot, sensors
 from jaxslam.core.types import Info, Log, Scan, Status, Trace
-from jaxslam.results.plot import _film, _grid_figures, _run_film
+from jaxslam.results.plot import _grid_figures, _run_film
 
 STEPS = 3
 # Landmark 2 is new in the last step; a measurement of landmark 1 fails the gate there.
@@ -38,21 +38,14 @@ def run_of(steps=STEPS, seen=None):
     return Trace(grown, info, None, seen), Log(np.zeros((steps, 2)), scan), truth
 
 
-def scene_of(steps=STEPS, seen=None, frames=_run_film.MOST, **options):
+def film_of(steps=STEPS, seen=None, frames=_run_film.MOST, **options):
     trace, log, truth = run_of(steps, seen)
     true = {"true_points": truth.landmarks, "true_path": truth.pose} | options
     return (
-        _run_film.run_scene(_run_film.history_of(trace, log, frames), **true),
+        _run_film.run_film(_run_film.history_of(trace, log, frames), **true),
         trace.estimate,
         truth,
     )
-
-
-def staged(panel):
-    """The axes of a panel, and what sets them to frame k."""
-    _, (axes,) = plot.panels_of(4.0, 4.0, 1)
-    draws = [layer(axes) for layer in panel.layers]
-    return axes, lambda k: [draw(k) for draw in draws]
 
 
 def line(axes, label):
@@ -69,8 +62,8 @@ def triangles(axes):
 
 
 def test_a_frame_has_the_robot_the_path_so_far_and_the_truth():
-    scene, estimate, truth = scene_of()
-    axes, draw = staged(scene.main)
+    film, estimate, truth = film_of()
+    (axes, _), draw = film.figure.axes, film.update
     np.testing.assert_array_equal(line(axes, "true landmarks"), truth.landmarks)
     for k in (0, 2, 1):  # in any order
         draw(k)
@@ -87,8 +80,8 @@ def test_a_frame_has_the_robot_the_path_so_far_and_the_truth():
 
 
 def test_landmarks_have_ellipses_of_three_sigma_that_grow():
-    scene, estimate, _ = scene_of()
-    axes, draw = staged(scene.main)
+    film, estimate, _ = film_of()
+    (axes, _), draw = film.figure.axes, film.update
     for k in range(STEPS):
         draw(k)
         rings = line(axes, "landmark, 3 σ").reshape(int(ALIVE[k].sum()), -1, 2)[:, :-1]
@@ -106,8 +99,8 @@ def ring_of_robot(axes):
 
 
 def test_beams_go_to_the_landmarks_measured_in_the_step():
-    scene, estimate, _ = scene_of()
-    axes, draw = staged(scene.main)
+    film, estimate, _ = film_of()
+    (axes, _), draw = film.figure.axes, film.update
     expected = {0: {"new": [0, 1]}, 1: {"fused": [1]}, 2: {"new": [2], "dropped": [1]}}
     for k, kinds in expected.items():
         draw(k)
@@ -116,7 +109,7 @@ def test_beams_go_to_the_landmarks_measured_in_the_step():
             to = kinds.get(outcome, [])
             np.testing.assert_array_equal(ends[:, 0], np.tile(estimate.pose[k, :2], (len(to), 1)))
             np.testing.assert_array_equal(ends[:, 1], estimate.points[k][to])
-    assert [scene.caption(k) for k in range(STEPS)] == [
+    assert [film.caption(k) for k in range(STEPS)] == [
         "step 1 of 3 · 2 measurements: 0 fused, 2 new, 0 dropped",
         "step 2 of 3 · 1 measurement: 1 fused, 0 new, 0 dropped",
         "step 3 of 3 · 2 measurements: 0 fused, 1 new, 1 dropped",
@@ -131,23 +124,23 @@ def test_beams_go_to_the_landmarks_measured_in_the_step():
 
 def test_a_frame_of_many_steps_has_all_their_beams():
     """9 steps in 3 frames: steps 0; 1 … 4; 5 … 8."""
-    scene, estimate, _ = scene_of(9, frames=3)
-    assert scene.note == "3 of 9 steps are shown, evenly in time"
-    axes, draw = staged(scene.main)
+    film, estimate, _ = film_of(9, frames=3)
+    assert film.note == "3 of 9 steps are shown, evenly in time"
+    (axes, _), draw = film.figure.axes, film.update
     draw(1)
     # Of step 2 landmark 2, of step 3 landmarks 0 and 1; in frame 1, of step 4, landmark 2 is gone.
     np.testing.assert_array_equal(beams(axes, "new")[:, 0], estimate.pose[[3, 3], :2])
     np.testing.assert_array_equal(beams(axes, "new")[:, 1], estimate.points[4][:2])
     np.testing.assert_array_equal(beams(axes, "fused")[:, 0], estimate.pose[[1, 4], :2])
-    assert scene.caption(1) == "step 5 of 9 · 6 measurements: 2 fused, 3 new, 1 dropped"
-    every = scene_of(9)[0]
+    assert film.caption(1) == "step 5 of 9 · 6 measurements: 2 fused, 3 new, 1 dropped"
+    every = film_of(9)[0]
     assert every.note == "" and every.frames == 9
 
 
 def test_the_robot_is_shown_from_near_with_the_truth_on_a_fixed_scale():
-    scene, estimate, truth = scene_of()
-    axes, draw = staged(scene.beside)
-    low, high = scene.beside.xlim
+    film, estimate, truth = film_of()
+    (_, axes), draw = film.figure.axes, film.update
+    low, high = film.figure.axes[1].get_xlim()
     assert -low == high == pytest.approx(1.08 * 0.3)
     for k in range(STEPS):
         draw(k)
@@ -157,27 +150,29 @@ def test_the_robot_is_shown_from_near_with_the_truth_on_a_fixed_scale():
         np.testing.assert_allclose(np.hypot(*line(axes, "robot, 3 σ")[:-1].T), 0.3)
     # An error far beyond the ellipse does not set the scale; it is marked at the edge.
     away = truth.pose + [5.0, 0.0, 0.0]
-    far, _, _ = scene_of(true_path=away)
-    axes, draw = staged(far.beside)
+    far, _, _ = film_of(true_path=away)
+    (_, axes), draw = far.figure.axes, far.update
     draw(0)
-    edge = far.beside.xlim[1]
+    edge = far.figure.axes[1].get_xlim()[1]
     assert edge == pytest.approx(1.08 * 0.9)
     assert line(axes, "true position beyond")[0, 0] == edge and not len(line(axes, "true position"))
-    assert scene_of(true_path=None)[0].beside.title == "about the estimated position"
+    beside = film_of(true_path=None)[0].figure.axes[1]
+    assert beside.get_title(loc="left") == "about the estimated position"
 
 
 def test_limits_are_those_of_the_truth_unless_the_estimate_is_near():
-    scene, estimate, truth = scene_of()
+    film, estimate, truth = film_of()
     shown = np.concatenate([truth.landmarks, truth.pose[:, :2], estimate.points[2]])
-    for (low, high), values in zip((scene.main.xlim, scene.main.ylim), shown.T, strict=True):
+    main = film.figure.axes[0]
+    for (low, high), values in zip((main.get_xlim(), main.get_ylim()), shown.T, strict=True):
         assert low < values.min() and values.max() < high
     trace, log, truth = run_of()
     lost = trace._replace(estimate=trace.estimate._replace(pose=trace.estimate.pose * 100))
-    scene = _run_film.run_scene(
-        _run_film.history_of(lost, log), true_points=truth.landmarks, true_path=truth.pose
-    )
-    assert np.ptp(scene.main.xlim) < 12
-    assert np.ptp(_run_film.run_scene(_run_film.history_of(lost, log)).main.xlim) > 200
+    history = _run_film.history_of(lost, log)
+    true = {"true_points": truth.landmarks, "true_path": truth.pose}
+    for more, low, high in ((true, 0, 12), ({}, 200, np.inf)):
+        main = _run_film.run_film(history, **more).figure.axes[0]
+        assert low < np.ptp(main.get_xlim()) < high
 
 
 def test_particles_are_drawn_by_weight():
@@ -185,10 +180,9 @@ def test_particles_are_drawn_by_weight():
     seen = _run_film.Cloud(
         rng.normal(size=(STEPS, 4, 3)), np.tile([0.5, 0.25, 0.25, 0.0], (STEPS, 1))
     )
-    scene, estimate, _ = scene_of(seen=seen)
-    for panel, origin in ((scene.main, 0.0), (scene.beside, estimate.pose[1, :2])):
-        axes, draw = staged(panel)
-        draw(1)
+    film, estimate, _ = film_of(seen=seen)
+    film.update(1)
+    for axes, origin in zip(film.figure.axes, (0.0, estimate.pose[1, :2]), strict=True):
         (dots,) = [collection for collection in axes.collections if len(collection.get_offsets())]
         np.testing.assert_allclose(dots.get_offsets(), seen.pose[1, :3, :2] - origin)
         np.testing.assert_allclose(dots.get_sizes(), [8.0, 4.0, 4.0])
@@ -198,12 +192,16 @@ def test_links_appear_and_are_cut():
     strength = np.zeros((STEPS, 4, 4))
     strength[0, 0, 1] = strength[1, 0, 1] = strength[1, 1, 2] = 0.25
     strength[2, 1, 2] = 1.0
-    scene, estimate, _ = scene_of(seen=_run_film.Links(strength + np.swapaxes(strength, 1, 2)))
-    axes, draw = staged(scene.main)
+    film, estimate, _ = film_of(seen=_run_film.Links(strength + np.swapaxes(strength, 1, 2)))
+    (axes, _), draw = film.figure.axes, film.update
     between, robot = (
         next(collection for collection in axes.collections if collection.get_label() == label)
         for label in ("link of landmarks", "link to the robot")
     )
+    shown = {text.get_text() for text in film.figure.axes[1].get_legend().get_texts()}
+    assert {"link of landmarks", "link to the robot", "link cut"} <= shown
+    handles = film.figure.axes[1].get_legend().legend_handles
+    assert len({str(handle.get_color()) for handle in handles[:4]}) > 2
     for k, (of_robot, of_landmarks, cut) in enumerate([(1, 0, 0), (1, 1, 0), (0, 1, 1)]):
         draw(k)
         position, points = estimate.pose[k, :2], estimate.points[k]
@@ -219,8 +217,8 @@ def test_hypotheses_are_drawn_until_they_are_landmarks():
     points = np.arange(STEPS * 4.0).reshape(STEPS, 2, 2)
     covs = np.tile(0.04 * np.eye(2), (STEPS, 2, 1, 1))
     seen = _run_film.Hypotheses(points, covs, np.array([[0.0, 0.0], [1.0, 3.0], [0.0, 1.5]]))
-    scene, *_ = scene_of(seen=seen)
-    axes, draw = staged(scene.main)
+    film, *_ = film_of(seen=seen)
+    (axes, _), draw = film.figure.axes, film.update
     (marked,) = [artist for artist in axes.lines if artist.get_marker() == "D"]
     for k, shown in enumerate([[], [0, 1], [1]]):
         draw(k)
@@ -228,7 +226,7 @@ def test_hypotheses_are_drawn_until_they_are_landmarks():
         rings = line(axes, "hypothesis, 3 σ").reshape(len(shown), 50, 2)[:, :-1]
         away = np.linalg.norm(rings - points[k, shown][:, None], axis=2)
         np.testing.assert_allclose(away, 0.6)
-    counts = [scene.caption(k).rpartition(" · ")[2] for k in range(STEPS)]
+    counts = [film.caption(k).rpartition(" · ")[2] for k in range(STEPS)]
     assert counts == ["0 hypotheses", "2 hypotheses", "1 hypothesis"]
 
 
@@ -237,11 +235,7 @@ def test_hypotheses_are_drawn_until_they_are_landmarks():
 
 def pictures(film):
     """The pixels of each frame."""
-    shown = []
-    for k in range(film.scene.frames):
-        film._draw_frame(k)
-        shown.append(np.array(film._fig.axes[0].images[0].get_array()))
-    return shown
+    return [film.picture(k) for k in range(film.frames)]
 
 
 def test_frames_differ_and_need_no_display(monkeypatch, tmp_path):
@@ -250,24 +244,18 @@ def test_frames_differ_and_need_no_display(monkeypatch, tmp_path):
     trace, log, truth = run_of()
     done = []
     film = plot.animate(trace, log, truth, title="ring")
-    film.save(tmp_path / "a.gif", dpi=40, progress_callback=lambda k, n: done.append((k, n)))
-    assert done == [(0, 3), (1, 3), (2, 3)] and film.scene.title == "ring"
+    film.save(tmp_path / "a.gif", progress_callback=lambda k, n: done.append((k, n)))
+    assert done == [(0, 3), (1, 3), (2, 3)] and film.title == "ring"
     assert len({picture.tobytes() for picture in pictures(film)}) == 3
 
 
-def test_another_film_is_another_layer():
-    images = np.stack([np.full((2, 2), k / 2) for k in range(3)])
-
-    def growing(axes):
-        image = axes.imshow(images[0], cmap="gray", vmin=0, vmax=1, extent=(0, 1, 0, 1))
-        return lambda k: image.set_data(images[k])
-
-    panel = plot.Panel(
-        [growing, _film.still(np.array([[0.5, 0.5]]), color="white")], (0, 1), (0, 1)
-    )
-    film = plot.Film(plot.Scene(3, panel), width=4.0, fps=4)
+def test_another_film_is_another_update():
+    figure, (axes, _) = plot.stage((0, 1), (0, 1), width=4.0)
+    image = axes.imshow(np.zeros((2, 2)), cmap="gray", vmin=0, vmax=1, extent=(0, 1, 0, 1))
+    axes.plot(0.5, 0.5, ".", color="white")
+    film = plot.Film(figure, lambda k: image.set_data(np.full((2, 2), k / 2)), 3, fps=4)
     middle = [picture[110, 100, 0] for picture in pictures(film)]
-    assert [film.scene.caption(k) for k in range(3)] == ["frame 1", "frame 2", "frame 3"]
+    assert [film.caption(k) for k in range(3)] == ["frame 1", "frame 2", "frame 3"]
     np.testing.assert_allclose(middle, [0, 128, 255], atol=20)
 
 
@@ -297,12 +285,14 @@ def test_arrays_that_do_not_belong_together_are_refused():
         ValueError, match=r"trace: expected that of one run, poses \(T, 3\), got \(1, 3, 3\)"
     ):
         plot.animate(batch, log)
-    scene, *_ = scene_of()
-    for more in ({"fps": 0}, {"width": -1.0}):
-        with pytest.raises(
-            ValueError, match=f"Film: {next(iter(more))}: expected a number above 0"
-        ):
-            plot.Film(scene, **more)
+    figure, _ = plot.stage((0, 1), (0, 1))
+    for make, message in (
+        (lambda: plot.Film(figure, print, 1, fps=0), "Film: fps: expected a number above 0"),
+        (lambda: plot.Film(figure, print, 0), "Film: frames: expected an integer >= 1"),
+        (lambda: plot.stage((0, 1), (0, 1), width=-1.0), "stage: width: expected a number above 0"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            make()
 
 
 def test_a_run_that_is_not_finite_is_drawn_as_far_as_it_goes_and_says_so():
@@ -311,7 +301,7 @@ def test_a_run_that_is_not_finite_is_drawn_as_far_as_it_goes_and_says_so():
     pose[2], covs[1, 0] = np.nan, -np.eye(2)
     broken = trace._replace(estimate=trace.estimate._replace(pose=pose, point_covs=covs))
     film = plot.animate(broken, log, truth)
-    said = film.scene.caption
+    said = film.caption
     assert said(1).endswith("1 without ellipse") and said(2).endswith("pose not finite")
     assert len(pictures(film)) == 3
 
@@ -390,8 +380,8 @@ def test_a_filter_is_filmed_in_a_world_by_itself():
     world = worlds.ring(4)
     film = plot.animate_world(world, catalog.ALL["dead_reckoning"](world), jax.random.key(0))
     assert len({picture.tobytes() for picture in pictures(film)}) == 4
-    assert film.scene.title == "ring"
-    assert film.scene.caption(0) == "step 1 of 4 · 6 measurements: 0 fused, 0 new, 6 dropped"
+    assert film.title == "ring"
+    assert film.caption(0) == "step 1 of 4 · 6 measurements: 0 fused, 0 new, 6 dropped"
 
 
 def test_mapping_from_a_known_path_is_filmed():
@@ -402,21 +392,22 @@ def test_mapping_from_a_known_path_is_filmed():
     mapping = filters.Mapping(world.sensor, 6)
     trace = jaxslam.run(mapping, log, *start, jax.random.key(1), probe=plot.probe)
     film = plot.animate(trace, log, truth)
-    assert film.scene.caption(0) == "step 1 of 4 · 6 measurements: 0 fused, 6 new, 0 dropped"
-    assert film.scene.caption(3) == "step 4 of 4 · 6 measurements: 6 fused, 0 new, 0 dropped"
+    assert film.caption(0) == "step 1 of 4 · 6 measurements: 0 fused, 6 new, 0 dropped"
+    assert film.caption(3) == "step 4 of 4 · 6 measurements: 6 fused, 0 new, 0 dropped"
     assert len({picture.tobytes() for picture in pictures(film)}) == 4
 
 
-def test_a_map_scene_has_as_many_paths_as_maps():
+def test_a_map_film_has_as_many_paths_as_maps():
     origin, path = np.zeros(3), np.zeros((2, 3))
     maps = [np.zeros((2, 3)), np.ones((2, 3))]
-    scene = _grid_figures.map_scene(maps, origin, 0.5, [path, path], ["one", "two"])
-    assert scene.frames == 2 and scene.caption(1) == "two"
-    assert scene.main.xlim == (0.0, 1.5) and scene.main.ylim == (0.0, 1.0)
+    film = _grid_figures.map_film(maps, origin, 0.5, [path, path], ["one", "two"])
+    assert film.frames == 2 and film.caption(1) == "two"
+    main = film.figure.axes[0]
+    assert main.get_xlim() == (0.0, 1.5) and main.get_ylim() == (0.0, 1.0)
     for wrong, message in (
         ((maps, origin, 0.5, [path], ["one", "two"]), "as many paths"),
         (([], origin, 0.5, [], []), "as many paths"),
         ((maps, np.ones(3), 0.5, [path, path], ["one", "two"]), "without yaw"),
     ):
         with pytest.raises(ValueError, match=message):
-            _grid_figures.map_scene(*wrong)
+            _grid_figures.map_film(*wrong)
