@@ -320,8 +320,17 @@ def shapes_of(
         return Shape(fault, weights, float(np.sum(weights * change)))
 
     changes = innovations[1:] - innovations[0]
-    of_faults = [shape_of(*pair) for pair in zip(faults, changes, strict=False)]
     halves = changes[len(faults) :]
+    if slips:
+        # The log of a larger world is one of travel that is recorded too short. Its shape by the
+        # odometry alone; that of longer ranges holds the travel of the smoothed path, whose noise
+        # was found in the same innovations.
+        shorter = -halves.sum(axis=0)
+        changes = [
+            shorter if fault.name == "longer" else change
+            for fault, change in zip(faults, changes, strict=False)
+        ]
+    of_faults = [shape_of(*pair) for pair in zip(faults, changes, strict=False)]
     # To first order a slip of two parts does what one in each does.
     of_slips = [shape_of(_SLIP, halves[k] + halves[k + 1]) for k in range(WINDOWS * slips)]
     return (
