@@ -70,17 +70,12 @@ BENCHMARKS = {
     "honesty": "honesty",
     "seif": "seif",
     "comparison": "campaigns:comparison",
-    "soak": "soak",
-    "kill": "kill",
-    "fuzz": "commands:fuzz",
-    "wheel": "commands:wheel",
     "monte_carlo_localization": "monte_carlo_localization",
 }
 """Name: module, and function if it is not `measure`."""
 
 ON_REQUEST = {
     "graph_draws_thousand": "graphs.draws:thousand",
-    "soak_million": "soak:million",
     "laser_slam_logs": "laser_slam.logs",
     "mrclam_fit": "mrclam.fit",
     "seif_park": "seif:park",

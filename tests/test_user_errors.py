@@ -13,6 +13,7 @@ from jaxslam import (
     association,
     charts,
     filters,
+    grids,
     life,
     linearize,
     motion,
@@ -62,6 +63,36 @@ def test_a_model_that_was_not_called_or_is_none_is_told(name):
         KINDS[name](motion.Velocity, SEES)
     with pytest.raises(ValueError, match=rf"^{name}: sensor: expected a Sensor, got 3"):
         KINDS[name](MOVE, 3)
+
+
+@pytest.mark.parametrize(
+    ("make", "owner"),
+    [
+        (lambda v: life.Existence(lambda pose, at: True, detected=v), "Existence: detected: "),
+        (lambda v: life.Existence(lambda pose, at: True, confirm=v), "Existence: confirm: "),
+        (lambda v: jaxslam.scenarios.BetweenRanges(v, 5.0), "BetweenRanges: nearest: "),
+        (lambda v: filters.Localization(MOVE, SEES, v), "Localization: landmarks: "),
+        (lambda v: KINDS["ParticleLocalization"](MOVE, SEES, box=v), "ParticleLocalization: box: "),
+        (lambda v: smoothing.BatchMap(MOVE, SEES, 3, v, np.eye(3)), "BatchMap: pose: "),
+        (lambda v: grids.LikelihoodField(max_range=5.0, hit=v), "LikelihoodField: hit: "),
+        (lambda v: filters.EkfSlam(MOVE, SEES, v), "EkfSlam: capacity: "),
+    ],
+)
+@pytest.mark.parametrize("value", [object(), filters.EkfSlam, lambda: 1.0])
+def test_what_cannot_be_compared_is_refused_by_its_field(make, owner, value):
+    with pytest.raises(ValueError, match=f"^{owner}expected [^\n]*$"):
+        make(value)
+
+
+def test_a_refusal_of_an_array_has_one_line():
+    with pytest.raises(ValueError, match=r"^EkfSlam: capacity: expected [^\n]*$"):
+        filters.EkfSlam(MOVE, SEES, np.eye(2))
+    with pytest.raises(ValueError, match=r"^BearingOnly: free: expected \(mean, cov[^\n]*$"):
+        sensors.BearingOnly(np.eye(1), free=-np.eye(3))
+    with pytest.raises(
+        ValueError, match=r"^Localization: landmarks: expected real numbers, got 1j"
+    ):
+        filters.Localization(MOVE, SEES, 1j)
 
 
 def test_mapping_and_teams_look_at_their_models_too():

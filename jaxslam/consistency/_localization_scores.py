@@ -82,6 +82,20 @@ class LocalizationSummary(NamedTuple):
     """the step from which the error stays below the limit; inf for a run that is lost"""
     lost: float
     """share of the runs that are lost"""
+    not_finite: int = 0
+    """number of the runs with a NaN or ∞ in a step: no set covers the truth there, a run that ends
+    so is lost, and `energy` and `rmse` are of the other runs"""
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """Sentences that qualify the averages; () if nothing does."""
+        if not self.not_finite:
+            return ()
+        runs = len(self.converged_at)
+        return (
+            f"not finite (NaN or ∞) in {self.not_finite:,} of {runs:,} runs: the energy score and "
+            "the RMSE are of the others",
+        )
 
 
 def judge_localization(
@@ -257,7 +271,10 @@ def summarize_localization(
         )
     error = pose_error(scores.truth, scores.pose)  # type: ignore[arg-type]
     off = np.hypot(error[..., 0], error[..., 1])
-    wrong = (off >= limit[0]) | (np.abs(error[..., 2]) >= limit[1])
+    numbers = scores.pose, scores.pose_cov, scores.level, scores.energy
+    finite = np.stack([np.isfinite(n).reshape(*off.shape, -1).all(axis=-1) for n in numbers]).all(0)
+    near = (off < limit[0]) & (np.abs(error[..., 2]) < limit[1])
+    wrong = ~(near & finite)
     last = np.where(wrong.any(axis=1), steps - np.argmax(wrong[:, ::-1], axis=1), 0)
     converged_at = np.where(last < steps, last, np.inf)
     kept = np.isfinite(converged_at)
@@ -268,17 +285,18 @@ def summarize_localization(
         counted.sum(axis=1), 1
     )
     rmse = np.sqrt((off[kept, counted_steps] ** 2).mean(axis=1))
+    covers = finite & (np.asarray(scores.level) <= 0.95 + 1e-9)
+    energy = np.where(finite, scores.energy, np.nan)[:, counted_steps].mean(axis=1)
     return LocalizationSummary(
-        coverage=interval(
-            (np.asarray(scores.level)[:, counted_steps] <= 0.95 + 1e-9).mean(axis=1), LEVEL
-        ),
+        coverage=interval(covers[:, counted_steps].mean(axis=1), LEVEL),
         nees=positive_interval(np.where(counted.any(axis=1), per_run, np.nan), LEVEL),
         unimodal=float(scores.together[:, counted_steps].mean()),
-        energy=positive_interval(np.asarray(scores.energy[:, counted_steps]).mean(axis=1), LEVEL),
+        energy=positive_interval(energy, LEVEL),
         rmse=positive_interval(rmse, LEVEL),
         heading=float(np.median(np.abs(error[kept, counted_steps, 2]))) if kept.any() else np.nan,
         converged_at=converged_at,
         lost=float(1 - kept.mean()),
+        not_finite=int((~finite.all(axis=1)).sum()),
     )
 
 

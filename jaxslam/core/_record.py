@@ -55,12 +55,16 @@ def record(cls: type[_T]) -> type[_T]:
     def __post_init__(self: Any) -> None:
         checked = type(self) is cls  # not where a subclass calls super().__post_init__()
         with refusals_of(type(self).__name__):
-            if checked:
-                _check_declared(self, checks)
-            elif "__dataclass_fields__" not in type(self).__dict__:
-                raise InvalidField("", "expected @record above the class")
-            if between_fields is not None:
-                between_fields(self)
+            try:
+                if checked:
+                    _check_declared(self, checks)
+                elif "__dataclass_fields__" not in type(self).__dict__:
+                    raise InvalidField("", "expected @record above the class")
+                if between_fields is not None:
+                    between_fields(self)
+            except TypeError:  # of a value that cannot be compared, as text: its kind says more
+                _check_kinds(self)
+                raise
             if checked:
                 _check_kinds(self)
 

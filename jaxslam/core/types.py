@@ -71,6 +71,20 @@ class Status(IntEnum):
     """Of no landmark yet; kept as a stored measurement (`filters.DelayedSlam`)."""
 
 
+KEPT = (Status.FUSED, Status.BORN, Status.SIGHTED)
+"""Statuses of measurements that serve the map."""
+
+DROPS = (
+    Status.REJECTED,
+    Status.OVERFLOW,
+    Status.DEFERRED,
+    Status.REPEATED,
+    Status.SINGULAR,
+    Status.UNMATCHED,
+)
+"""Statuses of measurements that the map does not get: the reasons."""
+
+
 class Scan(NamedTuple):
     """The measurements of one step, padded to M slots."""
 
@@ -306,10 +320,12 @@ class Trace(NamedTuple):
 
     @property
     def doubts(self) -> tuple[str, ...]:
-        """What is wrong with the estimates, each with its count: NaN or ∞, or a pose covariance
-        that is not symmetric or not positive definite by more than rounding; () if nothing is.
+        """What is wrong with a run, each with its count; () if nothing is.
 
-        Of the values of one run or of many, outside of a trace (else ValueError).
+        An estimate or Info with NaN or ∞, a pose covariance that is not symmetric or not positive
+        definite by more than rounding, and over half of the measurements not used. Of the values of
+        one run or of many, outside of a trace (else ValueError). Beams are measurements of which a
+        filter may leave out most: they have no innovation, and are not counted.
         """
         if not is_concrete(self.estimate, self.info):
             raise InvalidField(
@@ -327,11 +343,23 @@ class Trace(NamedTuple):
             "pose_cov is not symmetric": faults.asymmetric,
             "pose_cov is not positive definite": faults.indefinite,
         }
-        return tuple(
+        doubts = [
             f"{fault} in {int(bad.sum()):,} of {steps:,} steps"
             for fault, bad in counts.items()
             if bad.any()
-        )
+        ]
+        # (runs, T·M): one row without a leading axis.
+        status = np.asarray(info.status)
+        became = status.reshape(int(np.prod(status.shape[:-2])), -1)
+        measured, used = (became != Status.EMPTY).sum(axis=1), np.isin(became, KEPT).sum(axis=1)
+        starved = (measured > 2 * used) & (np.shape(info.innovation)[-1] > 0)
+        if starved.any():
+            lost, total = (int(count[starved].sum()) for count in (measured - used, measured))
+            reasons = [(int((became[starved] == s).sum()), s.name.lower()) for s in DROPS]
+            listed = ", ".join(f"{count:,} {reason}" for count, reason in reasons if count)
+            runs = f" in {starved.sum():,} of {len(became):,} runs" * (status.ndim > 2)
+            doubts.append(f"{lost:,} of {total:,} measurements were not used{runs}: {listed}")
+        return tuple(doubts)
 
     def __repr__(self) -> str:
         lines = [

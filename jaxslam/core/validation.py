@@ -59,6 +59,7 @@ class InvalidField(ValueError):
     """A field of a record, or an argument of a function, that is not what was expected."""
 
     def __init__(self, field: str, reason: str, *, owner: str = "") -> None:
+        reason = " ".join(reason.split()) if "\n" in reason else reason  # of an array, say
         super().__init__(field, reason)
         self.owner = owner
         """the class of the record, or the function; "" until a `refusals_of` fills it in"""

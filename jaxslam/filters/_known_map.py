@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, Int
 
 from jaxslam.core._numbers import as_array, is_concrete
-from jaxslam.core._record import set_field
+from jaxslam.core._record import check_field, set_field
 from jaxslam.core.validation import InvalidField
 
 
@@ -16,8 +16,8 @@ def hold_map(filter: Any) -> None:
 
     Raises InvalidField on invalid ones.
     """
-    landmarks, tags = as_array(filter.landmarks), filter.tags
-    set_field(filter, "landmarks", landmarks)
+    check_field(filter, "landmarks", as_array)
+    landmarks, tags = filter.landmarks, filter.tags
     size, shape = len(filter.sensor.landmark), np.shape(landmarks)
     if len(shape) != 2 or shape[1] != size or shape[0] == 0:
         raise InvalidField("landmarks", f"expected shape (at least 1, {size}), got {shape}")

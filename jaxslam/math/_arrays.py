@@ -50,13 +50,19 @@ def is_concrete(*values: object) -> bool:
 
 
 def as_array(values: ArrayLike) -> ArrayLike:
-    """An array unchanged; numbers in lists or tuples as an array of float64 on the host."""
+    """An array unchanged; numbers in lists or tuples as an array of float64 on the host.
+
+    Raises ValueError on what is no real number.
+    """
     if hasattr(values, "dtype"):
         return values
     if not is_concrete(values):
         return jnp.asarray(values)
-    # NumPy, since jnp.asarray would round to float32 unless the user has 64-bit types on.
-    return np.asarray(values, np.float64)
+    try:
+        # NumPy, since jnp.asarray would round to float32 unless the user has 64-bit types on.
+        return np.asarray(values, np.float64)
+    except TypeError:
+        raise ValueError(f"expected real numbers, got {values!r:.60}") from None
 
 
 def in_dtype(tree: _T, dtype: DTypeLike) -> _T:

@@ -42,7 +42,9 @@ BLOCKS = "blocks"
 FORMATS = ("png", "pdf", "svg")
 """Formats of the files of figures."""
 
-FIGURES = ("nees", "rmse", "cost", "coverage", "whiteness", "gained", "errors", "map")
+_OF_A_RUN = ("errors", "map")
+
+FIGURES = ("nees", "rmse", "cost", "coverage", "whiteness", "gained", *_OF_A_RUN)
 """The figures, by the names of their files; the last two are of run 0."""
 
 _IN_NOTEBOOK = ("nees", "rmse")
@@ -91,16 +93,13 @@ def save_campaign(
             raise InvalidField("folder", f"expected a path, got {folder!r}")
     folder = Path(folder)
     check_writable(folder)
-    drawings = _drawings(campaign, seed)
-    existing = [name for name in file_names(formats, drawings) if (folder / name).exists()]
+    names = file_names(formats, FIGURES if campaign.first else FIGURES[: -len(_OF_A_RUN)])
+    existing = [name for name in names if (folder / name).exists()]
     if existing and not overwrite:
         raise ValueError(
             f"Campaign.save: {folder / existing[0]} exists: overwrite=True replaces it, or choose "
             "another folder"
         )
-    from jaxslam.results import _page as page  # matplotlib is slow to load
-    from jaxslam.results.plot._style import encode
-
     numbers: Files = {
         RESULT: report.as_json(campaign, command, seed),
         CURVES: report.as_csv(campaign),
@@ -112,10 +111,14 @@ def save_campaign(
         if (folder / RESULT).read_text(encoding="utf-8") == numbers[RESULT]:
             stale = ()
     write_files(folder, numbers, replaces=tuple(stale))
+    # Matplotlib is slow to load, and where it cannot be loaded the numbers are there.
+    from jaxslam.results import _page as page
+    from jaxslam.results.plot._style import encode
+
     encode_once = cache(encode)  # the page and a file have the same picture
     figures_of_page: dict[str, tuple[str, Figure]] = {}
     pictures: Files = {}
-    for name, (caption, draw) in drawings.items():
+    for name, (caption, draw) in _drawings(campaign, seed).items():
         try:
             figure = draw()
             encode_once(figure, "png")

@@ -220,7 +220,8 @@ def as_json(campaign: Campaign, command: str = "", seed: int | None = None) -> s
 def table_csv(campaign: Campaign) -> str:
     """The table as CSV: a row per measure; for each filter the value and the ends of its interval.
 
-    Verdicts and bands are text; cells without a number are empty.
+    Verdicts and bands are text, and so are the doubts, below the verdicts, if a filter has any;
+    cells without a number are empty.
     """
     names = list(campaign.filters)
     ends = [f"{name}{end}" for name in names for end in ("", " low", " high")]
@@ -235,6 +236,9 @@ def table_csv(campaign: Campaign) -> str:
             else:
                 texts += [cell.text if cell.value is None else _csv_number(cell.value), "", ""]
         rows.append(texts)
+    doubts = ["; ".join(summary.doubts) for summary in campaign.filters.values()]
+    if any(doubts):
+        rows.insert(1, ["doubts", "", *(text for doubt in doubts for text in (doubt, "", ""))])
     return csv_text(["measure", "honest", *ends], rows)
 
 

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike
 
 from jaxslam.core._numbers import as_array, is_concrete
-from jaxslam.core._record import field, record, set_field, static
+from jaxslam.core._record import check_field, field, record, static
 from jaxslam.core._reprs import short_repr
 from jaxslam.core.protocols import Motion
 from jaxslam.core.types import Beams, JaxOrNumPy
@@ -87,7 +87,7 @@ class LaserWorld:
 
     def __post_init__(self) -> None:
         for name in ("controls", "pose"):
-            set_field(self, name, as_array(getattr(self, name)))
+            check_field(self, name, as_array)
 
 
 class LaserHistory(NamedTuple):

@@ -220,7 +220,7 @@ def _covariances(
     noise_cov: Callable[..., jax.Array], arguments: tuple[Values, ...], size: int
 ) -> str:
     """The fault of the noise covariances of `size` numbers at some arguments, or ""."""
-    covs = np.asarray(quick_jit(jax.vmap(noise_cov))(*arguments))
+    covs = np.asarray(quick_jit(jax.vmap(limit_loops(noise_cov)))(*arguments))
     if covs.shape[1:] != (size, size):
         return f"noise_cov returns shape {covs.shape[1:]}, expected ({size}, {size})"
     for cov in covs:

@@ -13,6 +13,7 @@ from jaxslam.core._numbers import is_concrete
 from jaxslam.core.protocols import Motion, Sensor
 from jaxslam.core.validation import InvalidField, covariance, positive, refusals_of, require
 from jaxslam.math._linalg import root_psd
+from jaxslam.verify._loops import limit_loops
 
 __all__ = ["Linearity", "linearity_index", "motion_linearity", "sensor_linearity"]
 
@@ -130,7 +131,7 @@ def motion_linearity(
         at = _vector("pose", pose, 3)
         control = _vector("u", u, len(motion.controls)).astype(at.dtype)
         require("pose_cov", pose_cov, covariance(3))
-    noise = motion.noise_cov(at, control)
+    noise = limit_loops(motion.noise_cov)(at, control)
     cov = jax.scipy.linalg.block_diag(jnp.asarray(pose_cov, at.dtype), noise)
     x = jnp.concatenate([at, jnp.zeros(noise.shape[0], at.dtype)])
 

@@ -3,6 +3,9 @@
 import dataclasses
 import json
 import shutil
+import subprocess
+import sys
+import time
 
 import drawn
 import numpy as np
@@ -209,3 +212,28 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path, refused):
     (mine.parent / "manifest.json").write_text("{")
     refused([*QUICK, "--out", tmp_path, "--overwrite"])
     assert mine.exists()
+
+
+@pytest.mark.sweep
+def test_a_command_killed_while_it_writes_is_made_good_by_the_next(tmp_path):
+    out, rng = tmp_path / "out", np.random.default_rng()
+    command = [sys.executable, "-m", "jaxslam", *QUICK, "--filters", "dead_reckoning"]
+    again = [sys.executable, "-m", "jaxslam", "consistency", "--resume", str(out)]
+    quiet = {"stdout": subprocess.DEVNULL}
+    subprocess.run([*command, "--out", str(out)], check=True, **quiet)
+    expected, csv = results(out), (out / "consistency.csv").read_bytes()
+    begin = time.perf_counter()
+    subprocess.run(again, check=True, **quiet)
+    seconds = time.perf_counter() - begin
+    for _ in range(4):
+        for name in ("consistency.json", "consistency.csv"):
+            (out / name).unlink(missing_ok=True)
+        process = subprocess.Popen(again, **quiet)
+        try:  # in its last third, where it writes
+            process.wait(seconds * rng.uniform(0.66, 1.0))
+        except subprocess.TimeoutExpired:
+            process.kill()
+        process.wait()
+    subprocess.run(again, check=True, **quiet)
+    assert results(out) == expected
+    assert (out / "consistency.csv").read_bytes() == csv

@@ -1,7 +1,7 @@
 """Every filter of the catalogue on logs of any numbers: finite, or refused by name; nothing is lost.
 
 One program a filter runs many logs at once, as under `jit` or `vmap`, where values are not checked.
-`python -m benchmarks --only fuzz` tries more, and runs the odd shapes, too.
+`JAXSLAM_FUZZ=20` tries more, and runs the odd shapes, too.
 """
 
 import dataclasses

@@ -79,6 +79,21 @@ def test_the_summary_averages_runs_and_says_which_are_lost():
         consistency.summarize_localization(scores(error), skip=4)
 
 
+def test_a_run_that_is_not_finite_is_covered_by_nothing_lost_and_counted():
+    error = np.full((4, 4), 0.1)
+    sound = consistency.summarize_localization(scores(error))
+    assert (sound.doubts, sound.not_finite, sound.lost) == ((), 0, 0.0)
+    with_nan = scores(error)
+    with_nan.pose[3, 2:] = np.nan
+    found = consistency.summarize_localization(with_nan)
+    assert found.coverage.value == pytest.approx(np.mean([1, 1, 1, 0.5]))
+    assert found.lost == 0.25 and found.converged_at[3] == np.inf
+    assert found.rmse.value == pytest.approx(0.1)
+    assert found.doubts == (
+        "not finite (NaN or ∞) in 1 of 4 runs: the energy score and the RMSE are of the others",
+    )
+
+
 def test_the_spread_over_seeds_is_in_units_of_the_claim():
     error = 0.1 * rng.normal(size=(4000, 2))
     found = seed_spread(scores(error))

@@ -541,6 +541,19 @@ def test_a_trace_counts_what_is_wrong_with_its_estimates():
     )
     assert all(doubt in repr(trace) for doubt in trace.doubts)
     assert jax.tree.map(jnp.asarray, trace).doubts == trace.doubts
+    status = trace.info.status
+    status[2:7] = Status.REJECTED
+    assert len(trace.doubts) == 3  # half of them
+    status[7] = Status.SINGULAR
+    lost = "6 of 10 measurements were not used: 5 rejected, 1 singular"
+    assert trace.doubts[3:] == (lost,)
+    many = made_trace(10, runs=(2, 4))
+    many.info.status[1, 2], many.info.status[0, 3] = status, Status.UNMATCHED
+    (doubt,) = many.doubts
+    lost = "not used in 2 of 8 runs: 5 rejected, 1 singular, 10 unmatched"
+    assert doubt == f"16 of 20 measurements were {lost}"
+    of_beams = trace.info._replace(innovation=np.zeros((10, 1, 0)))
+    assert len(trace._replace(info=of_beams).doubts) == 3
     with pytest.raises(
         ValueError,
         match=r"Trace: doubts: it needs values: use it outside of jax\.jit and jax\.vmap",

@@ -15,7 +15,7 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 WIDE = int(os.environ.get("JAXSLAM_FUZZ", "1"))
-"""How many times as many examples are tried, as by `python -m benchmarks --only fuzz`."""
+"""How many times as many examples are tried, as by `JAXSLAM_FUZZ=50 make test-all`."""
 
 
 def fuzz(examples):

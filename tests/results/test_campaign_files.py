@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from test_page import EVIL, GOOD, RUNS, STEPS, Reader, campaign, summary
 
-from jaxslam import plot
+from jaxslam import plot, results
 from jaxslam.consistency import Average
 from jaxslam.core.types import Estimate, Truth
 from jaxslam.results import _campaign_files, _report
@@ -157,6 +157,16 @@ def test_a_figure_that_fails_is_left_out_and_told(campaign_of_two, tmp_path, und
     assert {path.name for path in tmp_path.iterdir()} == {path.name for path in paths}
     assert {path.stem for path in paths if path.suffix == ".pdf"} == FIGURES - {"rmse"}
     assert {path.name for path in paths} > {*NUMBERS, "report.html"}
+
+
+def test_the_numbers_are_there_where_matplotlib_cannot_be_loaded(
+    campaign_of_two, tmp_path, monkeypatch
+):
+    monkeypatch.delattr(results, "_page", raising=False)
+    monkeypatch.setitem(sys.modules, "jaxslam.results._page", None)
+    with pytest.raises(ImportError):
+        campaign_of_two.save(tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == NUMBERS
 
 
 def test_a_folder_that_cannot_be_used_is_refused_before_anything_is_drawn(

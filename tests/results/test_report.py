@@ -125,6 +125,19 @@ def test_csv_holds_the_curves(campaign):
     np.testing.assert_allclose([float(x) for x in column[1:]], curve[1:], rtol=1e-8)
 
 
+def test_the_table_in_csv_has_the_doubts_below_the_verdicts(campaign):
+    sound, other = (dataclasses.replace(s, doubts=()) for s in campaign.filters.values())
+    doubted = dataclasses.replace(other, doubts=("not finite in 2 of 9 runs", "divergent"))
+    rows = []
+    for second in (other, doubted):
+        part = dataclasses.replace(campaign, filters={"sound": sound, "other": second})
+        rows.append(list(csv.DictReader(io.StringIO(_report.table_csv(part)))))
+    assert [row["measure"] for row in rows[1][:2]] == ["verdict", "doubts"]
+    told = rows[1].pop(1)
+    assert (told["sound"], told["other"]) == ("", "not finite in 2 of 9 runs; divergent")
+    assert rows[0] == rows[1]
+
+
 def test_a_filter_that_lacks_a_curve_has_empty_cells(campaign):
     first, second = campaign.filters.values()
     less = {key: values for key, values in first.curves.items() if key != "nees_pose"}

@@ -8,7 +8,7 @@ from cases import swept
 from own_models import changed
 from verified import by_name, failed
 
-from jaxslam import sensors
+from jaxslam import motion, sensors
 from jaxslam.verify import verify_jacobians
 from jaxslam.verify._loops import ROUNDS, limit_loops, with_loop_end
 
@@ -75,6 +75,17 @@ def test_the_loops_of_a_sensor_are_limited_in_every_check():
     report = verify_jacobians(looping, count=2)
     assert "observe undoes invert, whatever is free" in failed(report)  # cos is no distortion
     assert any(note.startswith("invert has no jacrev") for note in report.notes)
+
+
+@pytest.mark.parametrize("model", [sensors.RelativePosition, motion.Increment])
+def test_a_noise_whose_loop_never_ends_is_no_covariance(model):
+    def noise(*arguments):
+        never = jax.lax.while_loop(lambda x: x[0] > -2, jnp.cos, arguments[-1])
+        return 0.01 * jnp.eye(2, dtype=never.dtype) + 0 * never[0]
+
+    report = verify_jacobians(model(noise), count=2)
+    assert failed(report) == ["noise covariance"]
+    assert "NaN" in by_name(report, "noise covariance").detail
 
 
 def test_a_function_with_its_own_vector_jacobian_product_has_no_forward_mode():

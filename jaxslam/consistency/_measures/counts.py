@@ -3,20 +3,7 @@
 import numpy as np
 from jaxtyping import Int
 
-from jaxslam.core.types import Info, Status
-
-KEPT = (Status.FUSED, Status.BORN, Status.SIGHTED)
-"""Statuses of measurements that serve the map."""
-
-DROPS = (
-    Status.REJECTED,
-    Status.OVERFLOW,
-    Status.DEFERRED,
-    Status.REPEATED,
-    Status.SINGULAR,
-    Status.UNMATCHED,
-)
-"""Statuses of measurements that the map does not get: the reasons."""
+from jaxslam.core.types import DROPS, KEPT, Info, Status
 
 MEANINGS = {
     "measured": "measurements in the logs",

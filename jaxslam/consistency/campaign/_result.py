@@ -105,9 +105,9 @@ class Campaign:
 
         They are report.html (one page with its figures embedded), consistency.json (verdicts,
         measures and counts), measures.csv (the table of them), consistency.csv (the averages of
-        every step) and the figures. All of them appear when all are complete, or none. Two figures
-        show run 0 of each filter; they are left out where this process did not compute that run
-        (`first`).
+        every step) and the figures. The numbers are written before a figure is drawn, and one that
+        cannot be drawn is left out, with a warning. Two figures show run 0 of each filter; they are
+        left out where this process did not compute that run (`first`).
 
         Args:
             folder: it is created if needed.

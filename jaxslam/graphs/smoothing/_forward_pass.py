@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from jaxslam._driver import check_run, run
 from jaxslam.association._rules import Known
 from jaxslam.core._numbers import as_array
-from jaxslam.core._record import field, function_of, record, set_field, static
+from jaxslam.core._record import check_field, field, function_of, record, static
 from jaxslam.core._validation import motion_model, sensor_model
 from jaxslam.core.protocols import Associate, Component, Filter, Motion, Sensor, Wrapper
 from jaxslam.core.slots import Joint
@@ -126,7 +126,7 @@ class LogEstimator(Component):
                 f"{sensor.landmark} of {sensor.name}",
             )
         for start in ("pose", "pose_cov"):
-            set_field(self, start, as_array(getattr(self, start)))
+            check_field(self, start, as_array)
         self._check(LogEstimator, {"solve": "log, key"})
 
     def solve(self, log: Log, key: Array) -> Trace:
