@@ -38,6 +38,7 @@ BENCHMARKS = {
     "real_data": "real_data",
     "mrclam": "mrclam.benchmark",
     "woods": "woods",
+    "twins": "twins",
     "learned_noise": "mrclam.learned",
     "association": "association.benchmark",
     "baselines": "baselines",

@@ -133,8 +133,8 @@ def _on_true_path(filter: Filter, world: World) -> _OnTruePath:
 
 
 def _capacity(scenario: World) -> int:
-    """A slot for each landmark."""
-    return int(np.shape(scenario.landmarks)[0])
+    """The slots of the world's filters, by default one for each landmark."""
+    return scenario.capacity or int(np.shape(scenario.landmarks)[0])
 
 
 def _options(scenario: World, overrides: dict[str, Any], *names: str) -> dict[str, Any]:

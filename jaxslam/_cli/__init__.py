@@ -137,6 +137,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             set_device_count(options.devices)
         else:
             jax.config.update("jax_enable_x64", options.dtype == "float64")
+            if getattr(options, "check", False):  # twins are divided over the cores
+                set_device_count("all")
         try:
             jax.devices()
         except Exception as error:  # RuntimeError or AssertionError of a plugin without its device

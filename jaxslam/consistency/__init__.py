@@ -11,10 +11,12 @@ from jaxslam.consistency._localization_scores import (
     judge_localization,
     summarize_localization,
 )
+from jaxslam.consistency._log_statistics import Statistic
 from jaxslam.consistency._measures import Measure, register
 from jaxslam.consistency._measures.coverage import credibility
 from jaxslam.consistency._measures.measure import Nees, Runs, RunScores, RunStatistics
 from jaxslam.consistency._measures.nees import block_nees, pose_error
+from jaxslam.consistency._model_check import CheckedStatistic, ModelCheck, check_models
 from jaxslam.consistency._pairs import PairedDifference
 from jaxslam.consistency._recording import (
     ClockLag,
@@ -31,11 +33,13 @@ from jaxslam.consistency.campaign._run_estimates import Innovations, RunEstimate
 
 __all__ = [
     "Average",
+    "CheckedStatistic",
     "ClockLag",
     "Innovations",
     "LocalizationScores",
     "LocalizationSummary",
     "Measure",
+    "ModelCheck",
     "Nees",
     "PairedDifference",
     "RecordedBlock",
@@ -46,9 +50,11 @@ __all__ = [
     "RunStatistics",
     "Runs",
     "Score",
+    "Statistic",
     "Summary",
     "Verdict",
     "block_nees",
+    "check_models",
     "conditional_bound",
     "covering_level",
     "credibility",

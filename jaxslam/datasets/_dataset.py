@@ -14,6 +14,7 @@ from jaxslam.core.types import Log
 from jaxslam.core.validation import InvalidField, refusals_of, require
 from jaxslam.sensors._suite import Suite
 from jaxslam.sensors._team import Robot
+from jaxslam.simulation.spurious import Spurious
 
 
 class Parameter(NamedTuple):
@@ -95,6 +96,10 @@ class Dataset:
     """descriptions of the changes that the reader made"""
     assumed: tuple[str, ...] = ()
     """defaults that the reader took for settings missing in the files"""
+    default_noises: tuple[str, ...] = ()
+    """"motion", "sensor": the models whose noise the files do not state, so that it is a default"""
+    spurious: Spurious | None = None
+    """faults of the sensor that twins of the log have; None: nothing but noise"""
     source: str = ""
     """the publication of the data"""
     robots: tuple[Robot, ...] = ()

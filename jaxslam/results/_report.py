@@ -129,6 +129,22 @@ def sentences_on_verdicts(campaign: Campaign) -> list[str]:
     ]
 
 
+_SPOKEN = {"ekf": "the EKF", "right_invariant": "the right-invariant EKF", "ukf": "the UKF"}
+"""How a sentence calls filters; others by their names."""
+
+
+def verdict_on_twins(campaign: Campaign) -> str:
+    """The verdicts of a campaign of twins of a log, as a sentence."""
+    verdicts = []
+    for i, (name, summary) in enumerate(campaign.filters.items()):
+        text = f"{_SPOKEN.get(name, name)} {'is ' * (i == 0)}{summary.verdict}"
+        nees = summary.measures.get("nees_pose")
+        if summary.verdict != "consistent" and nees is not None:
+            text += f" (pose NEES {short(nees.value)} [{short(nees.low)}, {short(nees.high)}])"
+        verdicts.append(text)
+    return f"On a robot like yours {'; '.join(verdicts)}."
+
+
 def as_json(campaign: Campaign, command: str = "", seed: int | None = None) -> str:
     """The campaign without curves as JSON, with versions, seed and command; NaN is null."""
     filters = {

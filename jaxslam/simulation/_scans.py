@@ -1,6 +1,7 @@
 """Simulated scans: fields of view, and noisy measurements along a path."""
 
 from collections.abc import Callable
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -80,18 +81,28 @@ def sensor_scans(
         tag, valid = jnp.broadcast_to(jnp.arange(count), seen.shape), seen
     keys = jax.random.split(key, poses.shape[0])
 
-    def measure(pose: Array, tags: Array, targets: Array, key: Array) -> Array:
-        exact = jax.vmap(sensor.observe, (None, 0))(pose, targets[tags])
-        noise = jax.vmap(draw_gaussian)(jax.vmap(sensor.noise_cov)(exact), normals_like(key, exact))
-        return jax.vmap(sensor.residual)(exact + noise, jnp.zeros_like(exact))
+    of_pose = partial(noisy_scan, sensor)
+    scan = jax.vmap(of_pose, (0, by_time, 0, 0, 0))(poses, targets, tag, valid, keys)
+    return scan, seen.sum(axis=1) - valid.sum(axis=1)
 
-    z = jax.vmap(measure, (0, 0, by_time, 0))(poses, tag, targets, keys)
-    scan = Scan(
-        z=jnp.where(valid[:, :, None], z, 0.0),
+
+def noisy_scan(
+    sensor: Sensor,
+    pose: Float[Array, "3"],
+    targets: Float[Array, "C L"],
+    tag: Int[Array, "M"],
+    valid: Bool[Array, "M"],
+    key: Array,
+) -> Scan:
+    """The scan of a sensor at a pose, with drawn noise. tag: rows of the targets it measures."""
+    exact = jax.vmap(sensor.observe, (None, 0))(pose, targets[jnp.maximum(tag, 0)])
+    noise = jax.vmap(draw_gaussian)(jax.vmap(sensor.noise_cov)(exact), normals_like(key, exact))
+    z = jax.vmap(sensor.residual)(exact + noise, jnp.zeros_like(exact))
+    return Scan(
+        z=jnp.where(valid[:, None], z, 0.0),
         tag=jnp.where(valid, tag, -1).astype(jnp.int32),
         valid=valid,
     )
-    return scan, seen.sum(axis=1) - valid.sum(axis=1)
 
 
 def part_scan(

@@ -68,6 +68,8 @@ class World(Component):
     """(R, R) covariance of the true start about `pose`, and of that prior."""
     places: int | None = None
     """M measurement slots of a scan; None for as many as there are landmarks."""
+    capacity: int | None = None
+    """landmark slots of the filters of the catalog; None for as many as there are landmarks."""
     spurious: Spurious | None = None
     filter_options: dict[str, Any] = FrozenDict()
     """keyword arguments of `filters.EkfSlam` that belong to the experiment, as correction and gate;

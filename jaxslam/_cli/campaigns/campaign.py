@@ -32,6 +32,9 @@ class CampaignOptions(NamedTuple):
     seed: int = 0
     bound: bool = False
     dtype: str = "float64"
+    like: str | None = None
+    dataset: str = "table"
+    robot: int | None = None
 
 
 def add_world_options(group: argparse._ArgumentGroup) -> None:
@@ -130,6 +133,12 @@ def _campaign(
     that campaign replace those left out, else the defaults do.
     """
     chosen = {n: value for n, value in vars(options).items() if n in CampaignOptions._fields}
+    if chosen.get("like") is not None:
+        for name in ("scenario", "steps"):
+            if name in chosen:
+                raise ValueError(f"--{name}: expected none with --like, whose log has its own")
+    elif options.resume is None and (of_log := {"dataset", "robot"} & chosen.keys()):
+        raise ValueError(f"--{min(of_log)}: expected --like, too, the log that it is of")
     folder = options.resume or options.out or OUT
     if options.resume is None:
         chosen = CampaignOptions(**chosen)._asdict()

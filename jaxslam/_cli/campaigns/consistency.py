@@ -11,7 +11,7 @@ from typing import Any
 
 import jax
 
-from jaxslam._cli import cache
+from jaxslam._cli import cache, model_checks
 from jaxslam._cli.campaigns.campaign import (
     Spec,
     add_campaign_option,
@@ -28,19 +28,25 @@ from jaxslam._cli.common import (
     add_animate,
     add_figures,
     film_files,
+    summary_table,
     write_results,
 )
+from jaxslam._cli.recorded.filter_choice import read_dataset
 from jaxslam._cli.user_objects import UserObjects
 from jaxslam.catalog import ALL
+from jaxslam.consistency._model_check import LEAST
 from jaxslam.consistency._verdict import is_faulty
 from jaxslam.consistency.campaign import Campaign, Incomplete, Interrupted, monte_carlo
 from jaxslam.consistency.campaign._block_programs import drive_run, fitting_block
 from jaxslam.consistency.campaign._candidates import cast_floats
 from jaxslam.core._names import closest_name
 from jaxslam.core.protocols import Candidate
+from jaxslam.datasets import READERS, Dataset
 from jaxslam.results import _campaign_files as campaign_files
 from jaxslam.results._campaign_files import FORMATS
 from jaxslam.results._files import Files, Json
+from jaxslam.results._report import verdict_on_twins
+from jaxslam.simulation import Twin, twin
 from jaxslam.simulation._worlds import World, world_of_run
 
 
@@ -50,6 +56,25 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "campaign", "kept in the folder of results; --resume reads them there"
     )
     add_world_options(campaign)
+    campaign.add_argument(
+        "--like",
+        metavar="FOLDER",
+        default=argparse.SUPPRESS,
+        help="worlds like a log, in place of --scenario: its smoothed path and map, its controls, "
+        "what it saw in each row, with drawn noises; also compares statistics of the log with "
+        "those of its twins",
+    )
+    campaign.add_argument(
+        "--dataset",
+        default=argparse.SUPPRESS,
+        help=f"reader of --like, one of: {', '.join(READERS)} (default: table)",
+    )
+    campaign.add_argument(
+        "--robot",
+        type=int,
+        default=argparse.SUPPRESS,
+        help="number of the robot of --like, of several (default: the first)",
+    )
     add_campaign_option(
         campaign,
         "filters",
@@ -126,7 +151,15 @@ def run_campaign(options: argparse.Namespace, command: str) -> int:
     if options.executor is not None and options.devices != "all":
         raise ValueError("--executor: each worker has one device: expected no --devices with it")
     spec, user = spec_of(options), UserObjects()
-    scenario = user.scenario(spec.campaign.scenario, spec.campaign.steps)
+    data: Dataset | None = None
+    scenario: World
+    if spec.campaign.like is not None:
+        data = read_dataset(spec.campaign.dataset, spec.campaign.like, spec.campaign.robot)
+        if data.assumed:
+            print(summary_table({"": {"defaults taken": list(data.assumed)}}), end="\n\n")
+        scenario = twin(data)
+    else:
+        scenario = user.scenario(spec.campaign.scenario, spec.campaign.steps)
     filters = user.filters(spec.campaign.filters, scenario)
     runs, part = spec.campaign.runs, spec.part
     if spec.compare is not None:
@@ -190,9 +223,43 @@ def run_campaign(options: argparse.Namespace, command: str) -> int:
         return 0
     if keep.set_aside:  # some runs were computed again
         earlier = None
+    if data is not None:
+        campaign = replace(campaign, notes=(*campaign.notes, verdict_on_twins(campaign)))
     status = _write(spec, scenario, filters, campaign, earlier, command)
+    if isinstance(scenario, Twin) and data is not None:
+        status = max(status, _check(spec, scenario, filters, data, earlier))
     is_wrong = any(is_faulty(summary.counts) for summary in campaign.filters.values())
     return FAILED if is_wrong else status
+
+
+def _check(
+    spec: Spec,
+    world: Twin,
+    filters: Mapping[str, Candidate],
+    data: Dataset,
+    earlier: Json | None,
+) -> int:
+    """Compare the log with its twins, which are the runs; returns the exit status.
+
+    A check that was finished earlier stays as it is.
+    """
+    if earlier is not None and (spec.out / model_checks.CHECK).exists():
+        return 0
+    if spec.campaign.runs < LEAST:
+        print(f"\nno check of the models, which takes --runs {LEAST} or more")
+        return 0
+    checks = model_checks.check_log(
+        world,
+        filters,
+        data.log,
+        spec.campaign.runs,
+        jax.random.key(spec.campaign.seed),
+        devices=spec.devices,
+        block=spec.block or fitting_block(world, filters, spec.devices[0]),
+        dtype=spec.campaign.dtype,
+    )
+    drawings = model_checks.check_drawings(checks, spec.figures)
+    return write_results(spec.out, model_checks.check_files(checks), drawings)
 
 
 def _write(

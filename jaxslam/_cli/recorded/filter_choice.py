@@ -2,6 +2,7 @@
 
 import argparse
 import dataclasses
+import inspect
 from typing import Any
 
 import numpy as np
@@ -12,12 +13,22 @@ from jaxslam.catalog import ALL, KINDS, SMOOTHERS, on_given_poses
 from jaxslam.core.protocols import Candidate, Filter, Motion, Sensor
 from jaxslam.core.types import Truth
 from jaxslam.core.validation import InvalidField
-from jaxslam.datasets import Dataset
+from jaxslam.datasets import READERS, Dataset
 from jaxslam.datasets._landmark_logs.table_settings import association_options
 from jaxslam.simulation._worlds import Scenario
 
 NAMES = tuple(name for name in ALL if name not in ("ideal", "batch_map"))
 """Filters for a data set: those that need neither the truth nor the whole log at once."""
+
+
+def read_dataset(dataset: str, path: str, robot: int | None) -> Dataset:
+    """The data set of a reader by name. robot: its number, of a data set of several."""
+    reader = pick("dataset", dataset, READERS)
+    if robot is None:
+        return reader(path)
+    if "robot" not in inspect.signature(reader).parameters:
+        raise ValueError(f"--robot: expected none, since this data set has one robot, got {robot}")
+    return reader(path, robot)
 
 
 def with_options(data: Dataset, options: argparse.Namespace) -> Dataset:

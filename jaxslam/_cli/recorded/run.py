@@ -2,16 +2,16 @@
 
 import argparse
 import dataclasses
-import inspect
 from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxslam._cli import cache
+from jaxslam._cli import cache, model_checks
 from jaxslam._cli.common import (
     COUNT,
     FILMS,
@@ -27,8 +27,14 @@ from jaxslam._cli.common import (
     summary_table,
     write_results,
 )
-from jaxslam._cli.recorded.filter_choice import NAMES, chosen_filters, with_options
+from jaxslam._cli.recorded.filter_choice import (
+    NAMES,
+    chosen_filters,
+    read_dataset,
+    with_options,
+)
 from jaxslam._cli.recorded.filter_run import FilterRun, run_filter
+from jaxslam.consistency import ModelCheck
 from jaxslam.consistency._measures.counts import count_label
 from jaxslam.core.protocols import Filter
 from jaxslam.core.types import Estimate
@@ -39,6 +45,7 @@ from jaxslam.datasets._landmark_logs.table_settings import METHODS
 from jaxslam.results import report
 from jaxslam.results._campaign_files import FORMATS, formats_of_figures
 from jaxslam.results._files import Files, Json, json_text, versions
+from jaxslam.simulation import Twin, twin
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -77,6 +84,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="also write innovations.csv, as jaxslam judge reads it: each innovation with its "
         "covariance",
     )
+    model_checks.add_options(parser)
     add_figures(parser, FORMATS)
     add_animate(parser, "of each filter")
     cache.add_options(parser)
@@ -95,21 +103,26 @@ class RunPlan:
     """whether whole estimates are kept for films"""
     innovations: bool = False
     """whether innovations are kept for a file"""
+    world: Twin | None = None
+    """the twin of the log, where it is checked"""
+    twins: int = 100
+    """their number"""
 
     @classmethod
     def from_options(cls, options: argparse.Namespace) -> "RunPlan":
         """Read the data set that the options of the command name, and build its filters."""
+        if options.check:
+            model_checks.check_count(options.twins)
         if options.dataset not in READERS:  # laser logs are read by another command
             pick("dataset", options.dataset, {**READERS, "carmen": None, "rosbag": None})
-        reader = READERS[options.dataset]
-        robot = [] if options.robot is None else [options.robot]
-        if robot and "robot" not in inspect.signature(reader).parameters:
-            raise ValueError(
-                f"--robot: expected none, since this data set has one robot, got {options.robot}"
-            )
-        data = with_options(reader(options.path, *robot), options)
+        data = with_options(read_dataset(options.dataset, options.path, options.robot), options)
         return cls(
-            data, chosen_filters(data, options.filters), options.animate, options.innovations
+            data,
+            chosen_filters(data, options.filters),
+            options.animate,
+            options.innovations,
+            twin(data) if options.check else None,
+            options.twins,
         )
 
 
@@ -121,7 +134,11 @@ def run_dataset(options: argparse.Namespace, command: str) -> int:
     runs = run_filters(plan)
     summary = summarize(plan.data, runs, command)
     print_summary(summary, runs)
-    return write_runs(options.out, plan, runs, summary, formats)
+    checks: dict[str, ModelCheck] = {}
+    if plan.world is not None:
+        key = jax.random.key(0)
+        checks = model_checks.check_log(plan.world, plan.filters, plan.data.log, plan.twins, key)
+    return write_runs(options.out, plan, runs, summary, formats, checks)
 
 
 def run_filters(plan: RunPlan) -> dict[str, FilterRun]:
@@ -175,10 +192,11 @@ def write_runs(
     runs: Mapping[str, FilterRun],
     summary: Json,
     formats: tuple[str, ...],
+    checks: Mapping[str, ModelCheck] = MappingProxyType({}),
 ) -> int:
-    """Write trajectories, maps, the summary, the figure and films; returns the exit status."""
+    """Write trajectories, maps, the summary, checks, figures and films; returns the exit status."""
     data = plan.data
-    files: Files = {}
+    files: Files = model_checks.check_files(checks)
     for name, run in runs.items():
         suffix = f"-{name}" if len(runs) > 1 else ""
         further = () if run.result.path.further is None else data.motion.state[3:]
@@ -196,6 +214,7 @@ def write_runs(
             )
     files[SUMMARY] = json_text(summary | {"versions": versions()})
     drawings: Drawings = {"map": lambda: _figure(data, runs, formats)}
+    drawings |= model_checks.check_drawings(checks, formats)
     if plan.animate:
         drawings["film"] = lambda: _films(data, runs)
     return write_results(folder, files, drawings, FILMS)

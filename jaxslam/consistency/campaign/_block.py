@@ -35,6 +35,7 @@ from jaxslam.core.protocols import Candidate
 from jaxslam.core.types import Estimate, Info, Trace, Truth
 from jaxslam.core.validation import refusals_of
 from jaxslam.filters._ekf.monitor import MonitoredState
+from jaxslam.simulation._twin import Twin
 from jaxslam.simulation._worlds import Scenario, World
 
 BOUND = ""
@@ -70,7 +71,7 @@ class CampaignPlan:
         """Whether the divergence limit comes from the conditional bound of run 0: always where that
         is computed, and in worlds whose Jacobians at the truth are not known."""
         world = self.scenario
-        own_draw = type(world).draw is not Scenario.draw
+        own_draw = type(world).draw not in (Scenario.draw, Twin.draw)
         return self.bound or own_draw or world.spurious is not None
 
 

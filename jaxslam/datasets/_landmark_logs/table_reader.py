@@ -27,6 +27,7 @@ from jaxslam.datasets._landmark_logs.table_settings import (
 )
 from jaxslam.datasets._lines import DIGITS, LARGEST, none_left, read_bytes, stored_file
 from jaxslam.math._odometry_jumps import step_sizes
+from jaxslam.simulation.spurious import Spurious
 
 MISSING = frozenset(
     {"", "nan", "-nan", "<na>", "na", "n/a", "#n/a", "#na", "null", "none"}
@@ -456,8 +457,22 @@ def table(folder: str | Path, *, fitted: bool = True) -> Dataset:
         adjustable=adjustable._replace(cov=settings.calibration_cov(adjustable.parameters)),
         dropped=dropped,
         assumed=tuple(settings.assumed + notes),
+        default_noises=tuple(dict.fromkeys(settings.default_noises)),
+        spurious=_spurious(settings.outliers(), measurements),
         source=settings.text("source", ""),
     )
+
+
+def _spurious(outliers: float, measurements: Columns[int | str]) -> Spurious | None:
+    """Outliers of that share, within the largest distance that was measured; None of a share 0."""
+    if not outliers:
+        return None
+    distances = [
+        np.abs(values).max()
+        for name, values in measurements.columns.items()
+        if split_unit(name)[1] == "m"
+    ]
+    return Spurious(outliers=outliers, reach=max(distances, default=1.0))
 
 
 def _odometry_notes(odometry: Columns[int | str], from_poses: bool) -> list[str]:

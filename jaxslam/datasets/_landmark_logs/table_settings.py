@@ -249,8 +249,15 @@ class _WithInterval(Motion):
     def noises(self) -> tuple[str, ...]:  # type: ignore[override]
         return self.motion.noises
 
+    @property
+    def perturb(self) -> Callable[[jax.Array, jax.Array], jax.Array] | None:
+        return None if self.motion.perturb is None else self._perturb
+
     def step(self, pose: jax.Array, u: jax.Array, w: jax.Array) -> jax.Array:
         return self.motion.step(pose, u[:-1], w)
+
+    def _perturb(self, u: jax.Array, w: jax.Array) -> jax.Array:
+        return jnp.concatenate([self.motion.perturb(u[:-1], w), u[-1:]])
 
 
 def _read(path: Path) -> tuple[str, dict[str, Any]]:
@@ -275,7 +282,8 @@ def _read(path: Path) -> tuple[str, dict[str, Any]]:
 class TableSettings:
     """The settings of a folder, with its fitted numbers unless `fitted` is False.
 
-    `assumed` lists the defaults that replaced missing settings so far.
+    `assumed` lists the defaults that replaced missing settings so far, `default_noises` the
+    sections without a noise among them.
 
     Raises ValueError on a file that is not TOML, and on an unknown section or key.
     """
@@ -284,6 +292,7 @@ class TableSettings:
         self.path = path
         self.assumed: list[str] = []
         self._state_names: tuple[str, ...] = ()
+        self.default_noises: list[str] = []
         self._text, self.content = _read(path)
         if not path.exists():
             self.assumed.append(f"no {path.name}")
@@ -417,11 +426,11 @@ class TableSettings:
 
     def sensor(self, header: Sequence[str]) -> Parametric[Sensor]:
         """The sensor. header: the columns of the measurements."""
-        further = (*_RANGE_ERRORS, "across", "share", "delay", "max_range")
+        further = (*_RANGE_ERRORS, "across", "share", "delay", "max_range", "outliers")
         factory, options = self._model("sensor", sensors.REGISTRY, header, further)
         errors = {key: options.pop(key) for key in _RANGE_ERRORS if key in options}
         across, share = options.pop("across", None), options.pop("share", None)
-        for key in ("delay", "max_range"):  # settings of the log, not arguments of the model
+        for key in ("delay", "max_range", "outliers"):  # of the log, not arguments of the model
             options.pop(key, None)
         mount, has_mount = None, "mount" in inspect.signature(factory).parameters
         if "mount" in options:
@@ -492,6 +501,14 @@ class TableSettings:
     def max_range(self) -> float:
         """The range from which on the sensor says nothing [m]."""
         return self._positive("sensor", "max_range", np.inf)
+
+    def outliers(self) -> float:
+        """The share of measurements that are of anything but their landmark, in twins."""
+        share = self._positive("sensor", "outliers", 0.0)
+        if share > 1:
+            place = self._at("sensor", "outliers")
+            raise ValueError(f"{place}: expected a share from 0 to 1, got {share:g}")
+        return share
 
     def spacing(self) -> float:
         """The least time between two measurements of a landmark that are used [s]."""
@@ -642,6 +659,7 @@ class TableSettings:
         if noise is None:
             deviations = [defaults.get(split_unit(name)[1] or "", 0.1) for name in names]
             self.assumed.append(f"[{section}] noise = {deviations} ({', '.join(names)})")
+            self.default_noises.append(section)
         else:
             deviations = self._numbers(section, "noise", noise, names)
             if min(deviations) < 0:

@@ -76,7 +76,7 @@ def cost(sensor: Sensor, problem: Problem, at: Iterate, held: Iterate) -> Float[
     return 0.5 * ((at.start**2).sum() + (at.noise**2).sum() + squares.sum())
 
 
-def _linearize_at(motion: Motion, sensor: Sensor, problem: Problem, at: Iterate) -> Chain:
+def linearize_at(motion: Motion, sensor: Sensor, problem: Problem, at: Iterate) -> Chain:
     """The chain of the Gauss-Newton step: the models linearized at an iterate.
 
     It has as many rows a measurement as the chain of a filter (`smoothing._smoother.chain_of`).
@@ -214,7 +214,7 @@ def optimize_chain(
         may_step = (search.steps < iterations) & ~converged
         after, lower = _line_search(motion, sensor, problem, search, policy)
         moved = may_step & lower
-        chain = _linearize_at(motion, sensor, problem, after)
+        chain = linearize_at(motion, sensor, problem, after)
         squares = [(part**2).sum() for part in (after.start, after.noise, chain.steps.residual)]
         trial = after, chain, 0.5 * linalg.total(squares)
         iterate = search.at, search.chain, search.cost

@@ -26,6 +26,7 @@ except (ValueError, OSError, locale.Error):
         import matplotlib  # noqa: F401
 
 from jaxslam._public import publish
+from jaxslam.results.plot._check_figure import check_figure
 from jaxslam.results.plot._film import Film, stage
 from jaxslam.results.plot._graph_figures import graph_figure
 from jaxslam.results.plot._grid_figures import (
@@ -78,6 +79,7 @@ __all__ = [
     "animate_world",
     "band",
     "caption",
+    "check_figure",
     "cost_figure",
     "coverage_figure",
     "curve",
