@@ -12,8 +12,9 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxslam.consistency._intervals import EACH, LEVEL, percentage, spread
+from jaxslam.consistency._measures.counts import DROPS, KEPT
 from jaxslam.consistency._measures.nees import DOF
-from jaxslam.core.types import DROPS, KEPT, Status
+from jaxslam.core.types import Status
 from jaxslam.math.stats import normal_quantile, truncated_chi2_mean
 
 TESTS = {"nees_pose": "pose NEES", "nis_per_dof": "NIS / dof"}

@@ -71,19 +71,15 @@ class Status(IntEnum):
     SIGHTED = 9
     """Of no landmark yet; kept as a stored measurement (`filters.DelayedSlam`)."""
 
+    @property
+    def is_kept(self) -> bool:
+        """Whether the measurement serves the map."""
+        return self in (Status.FUSED, Status.BORN, Status.SIGHTED)
 
-KEPT = (Status.FUSED, Status.BORN, Status.SIGHTED)
-"""Statuses of measurements that serve the map."""
-
-DROPS = (
-    Status.REJECTED,
-    Status.OVERFLOW,
-    Status.DEFERRED,
-    Status.REPEATED,
-    Status.SINGULAR,
-    Status.UNMATCHED,
-)
-"""Statuses of measurements that the map does not get: the reasons."""
+    @property
+    def is_dropped(self) -> bool:
+        """Whether there is a measurement, and the map does not get it."""
+        return self != Status.EMPTY and not self.is_kept
 
 
 class Scan(NamedTuple):
@@ -365,15 +361,20 @@ class Trace(NamedTuple):
             if bad.any()
         ]
         # (runs, T·M): one row without a leading axis.
-        status = np.asarray(info.status)
-        became = status.reshape(int(np.prod(status.shape[:-2])), -1)
-        measured, used = (became != Status.EMPTY).sum(axis=1), np.isin(became, KEPT).sum(axis=1)
+        statuses = np.asarray(info.status)
+        became = statuses.reshape(int(np.prod(statuses.shape[:-2])), -1)
+        kept = [status for status in Status if status.is_kept]
+        measured, used = (became != Status.EMPTY).sum(axis=1), np.isin(became, kept).sum(axis=1)
         starved = (measured > 2 * used) & (np.shape(info.innovation)[-1] > 0)
         if starved.any():
             lost, total = (int(count[starved].sum()) for count in (measured - used, measured))
-            reasons = [(int((became[starved] == s).sum()), s.name.lower()) for s in DROPS]
+            reasons = [
+                (int((became[starved] == status).sum()), status.name.lower())
+                for status in Status
+                if status.is_dropped
+            ]
             listed = ", ".join(f"{count:,} {reason}" for count, reason in reasons if count)
-            runs = f" in {starved.sum():,} of {len(became):,} runs" * (status.ndim > 2)
+            runs = f" in {starved.sum():,} of {len(became):,} runs" * (statuses.ndim > 2)
             doubts.append(f"{lost:,} of {total:,} measurements were not used{runs}: {listed}")
         return tuple(doubts)
 

@@ -215,8 +215,8 @@ def _checksums(words: Sequence[str]) -> dict[str, str]:
 
 def _changed(earlier: object, files: Mapping[str, str]) -> list[str]:
     """The files whose checksum is not the earlier one."""
-    known = earlier if isinstance(earlier, dict) else {}
-    return [name for name, checksum in files.items() if known.get(name) != checksum]
+    checksums = earlier if isinstance(earlier, dict) else {}
+    return [name for name, checksum in files.items() if checksums.get(name) != checksum]
 
 
 def _end_of(said: Path) -> str:

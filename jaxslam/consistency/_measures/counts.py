@@ -3,7 +3,13 @@
 import numpy as np
 from jaxtyping import Int
 
-from jaxslam.core.types import DROPS, KEPT, Info, Status
+from jaxslam.core.types import Info, Status
+
+KEPT = tuple(status for status in Status if status.is_kept)
+"""Statuses of measurements that serve the map."""
+
+DROPS = tuple(status for status in Status if status.is_dropped)
+"""Statuses of measurements that the map does not get: the reasons."""
 
 MEANINGS = {
     "measured": "measurements in the logs",

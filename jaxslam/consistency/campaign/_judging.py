@@ -278,8 +278,8 @@ class _Judgement:
         """The sentence on runs that are not judged."""
         parts = []
         for reason, numbers in by_reason.items():
-            found = [(n, self.faults[n].detail) for n in numbers if n in self.faults]
-            details = [f"run {n}: {detail}" for n, detail in found if detail]
+            faults = [(n, self.faults[n].detail) for n in numbers if n in self.faults]
+            details = [f"run {n}: {detail}" for n, detail in faults if detail]
             listed = "; ".join(details[:_LISTED]) + "; …" * (len(details) > _LISTED)
             parts.append(f"{len(numbers):,} {reason}" + f" ({listed})" * bool(listed))
         lost = sum(map(len, by_reason.values()))
