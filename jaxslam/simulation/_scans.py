@@ -88,13 +88,16 @@ def sensor_scans(
 
 def noisy_scan(
     sensor: Sensor,
-    pose: Float[Array, "3"],
+    pose: Float[Array, "R"],
     targets: Float[Array, "C L"],
     tag: Int[Array, "M"],
     valid: Bool[Array, "M"],
     key: Array,
 ) -> Scan:
-    """The scan of a sensor at a pose, with drawn noise. tag: rows of the targets it measures."""
+    """The scan of a sensor at a pose, with drawn noise. tag: rows of the targets it measures.
+
+    pose: with the further numbers of the robot that the sensor takes.
+    """
     exact = jax.vmap(sensor.observe, (None, 0))(pose, targets[jnp.maximum(tag, 0)])
     noise = jax.vmap(draw_gaussian)(jax.vmap(sensor.noise_cov)(exact), normals_like(key, exact))
     z = jax.vmap(sensor.residual)(exact + noise, jnp.zeros_like(exact))

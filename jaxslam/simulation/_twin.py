@@ -20,7 +20,7 @@ from jaxslam._public import publish
 from jaxslam.core._numbers import is_concrete
 from jaxslam.core._record import FrozenDict, field, record, static
 from jaxslam.core.logs._tables import INTERVAL
-from jaxslam.core.protocols import Motion, Sensor
+from jaxslam.core.protocols import Motion, Sensor, motion_of_pose
 from jaxslam.core.types import Log, Truth
 from jaxslam.core.validation import InvalidField, array_of, at_least, or_none, refusals_of, require
 from jaxslam.math import _linalg as linalg
@@ -202,13 +202,15 @@ def twin(dataset: RecordedLog, *, spurious: Spurious | None = None) -> Twin:
         spurious: outliers and other faults of the sensor to put into the scans; default those that
             the data set states.
     Raises:
-        ValueError: on a log of several robots, one in which no landmark is seen twice, models
+        ValueError: on a log of several robots, a model with states beside the pose, a log in which
+            no landmark is seen twice, models
             without noise or with the defaults of a reader, a sensor that `BatchMap` refuses, and
             where the smoothing does not converge.
     """
     with refusals_of("twin"):
         if dataset.robots:
             raise InvalidField("dataset", "expected the log of one robot: choose one")
+        require("motion", dataset.motion, motion_of_pose)
         if dataset.default_noises:
             sections = " and ".join(f"[{name}]" for name in dataset.default_noises)
             raise InvalidField(
