@@ -203,9 +203,8 @@ def twin(dataset: RecordedLog, *, spurious: Spurious | None = None) -> Twin:
             the data set states.
     Raises:
         ValueError: on a log of several robots, a model with states beside the pose, a log in which
-            no landmark is seen twice, models
-            without noise or with the defaults of a reader, a sensor that `BatchMap` refuses, and
-            where the smoothing does not converge.
+            no landmark is seen twice, models without noise or with the defaults of a reader, a
+            sensor that `BatchMap` refuses, and where the smoothing does not converge.
     """
     with refusals_of("twin"):
         if dataset.robots:
