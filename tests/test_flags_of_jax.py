@@ -52,8 +52,8 @@ def test_no_scenario_promotes_dtypes(strict, name):
 @pytest.mark.parametrize("dtype", swept((np.float64, np.float32), np.float64))
 def test_no_model_promotes_dtypes(strict, name, dtype):
     model = build((sensors.REGISTRY | motion.REGISTRY)[name])
-    pose = jnp.ones(3, dtype)
     if isinstance(model, Sensor):
+        pose = jnp.ones(3 + len(model.robot), dtype)
         sizes = len(model.landmark), len(model.measurements), len(model.free.mean)
         landmark, z, s = (jnp.ones(size, dtype) for size in sizes)
         traced(
@@ -61,13 +61,14 @@ def test_no_model_promotes_dtypes(strict, name, dtype):
             (jax.jacfwd(model.invert, argnums=(0, 1)), pose, z, s),
             (model.residual, z, z),
             (model.noise_cov, z),
-            (model.embed, pose, pose[:2]),
+            (model.embed, pose[:3], pose[:2]),
             (model.position, landmark),
-            (model.carried, pose, landmark),
+            (model.carried, pose[:3], landmark),
             (model.observe_jacobians, pose, landmark),
             (model.invert_jacobians, pose, z, s),
         )
     else:
+        pose = jnp.ones(len(model.state), dtype)
         u, w = (jnp.ones(len(names), dtype) for names in (model.controls, model.noises))
         traced(
             (jax.jacfwd(model.step, argnums=(0, 1, 2)), pose, u, w),

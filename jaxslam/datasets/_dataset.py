@@ -78,9 +78,9 @@ class Dataset:
     pose (`true_at`); None if unknown"""
     true_at: Bool[np.ndarray, "T"] | None = None
     """mask of the rows with a true pose; None if all have one"""
-    true_paths: Float[np.ndarray, "R T 3"] | None = None
-    """true poses of the R robots of a log of several, if known; `true_path` is the first of them"""
-    true_paths_at: Bool[np.ndarray, "R T"] | None = None
+    true_paths: Float[np.ndarray, "K T 3"] | None = None
+    """true poses of the K robots of a log of several, if known; `true_path` is the first of them"""
+    true_paths_at: Bool[np.ndarray, "K T"] | None = None
     """mask of the rows with a true pose by robot; None if all have one"""
     one_frame: bool = False
     """whether `pose`, `landmarks` and `true_path` are in one frame; if not, compare after an

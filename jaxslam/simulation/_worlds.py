@@ -89,8 +89,8 @@ class World(Component):
     def __post_init__(self) -> None:
         self._check(World, {"draw": "key"})
         # A subclass may have a property in place of a field.
+        self._check_field("motion", instance_of(Motion))
         for name, check in {
-            "motion": instance_of(Motion),
             "sensor": instance_of(Sensor),
             "pose": finite(len(self.motion.state)),
             "pose_cov": covariance(len(self.motion.state)),

@@ -88,7 +88,8 @@ def assert_told(log, estimate, info, tame):
     assert np.isin(status, list(Status)).all()
     lost = valid & ~(np.abs(z) <= _numbers.largest(z)).all(axis=-1)
     assert (status[lost] == Status.REJECTED).all()
-    for leaf in (*estimate, info.nis, info.innovation, info.innovation_cov, info.log_likelihood):
+    scores = info.nis, info.innovation, info.innovation_cov, info.log_likelihood
+    for leaf in (*jax.tree.leaves(estimate), *scores):
         assert np.isfinite(leaf).all()
     dof = np.where(status == Status.FUSED, z.shape[-1], 0)
     np.testing.assert_array_equal(info.dof, dof)

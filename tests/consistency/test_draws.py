@@ -412,21 +412,22 @@ SENSORS.append(sensors.Corrected(sensors.RangeBearing(no_noise), (1.1, 0.2), axi
 def test_the_equations_of_a_motion_model_are_its_step(model):
     rng = np.random.default_rng(0)
     for size in (0.5, 0.0):
-        pose, w = rng.normal(size=3), size * rng.normal(size=len(model.noises))
+        pose, w = rng.normal(size=len(model.state)), size * rng.normal(size=len(model.noises))
         u = size * rng.normal(size=len(model.controls))
-        names = dict(zip(("x", "y", "theta"), pose, strict=True))
+        names = dict(zip(map(bare, model.state), pose, strict=True))
         names |= dict(zip(map(bare, model.controls), u, strict=True))
         names |= {f"w_{bare(n)}": value for n, value in zip(model.noises, w, strict=True)}
         scope = solved(model, names)
-        moved = [scope[name] for name in ("x1", "y1", "theta1")]
+        moved = [scope[f"{bare(name)}1"] for name in model.state]
         np.testing.assert_allclose(moved, model.step(pose, u, w), rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("model", SENSORS, ids=lambda model: type(model).__name__ + model.name)
 def test_the_equations_of_a_sensor_are_its_measurement(model):
     rng = np.random.default_rng(1)
-    pose, landmark = rng.normal(size=3), 2.0 + rng.random(len(model.landmark))
-    names = dict(zip(("x_s", "y_s", "theta_s"), pose, strict=True))
+    pose, landmark = rng.normal(size=3 + len(model.robot)), 2.0 + rng.random(len(model.landmark))
+    robot = ("x_s", "y_s", "theta_s", *map(bare, model.robot))
+    names = dict(zip(robot, pose, strict=True))
     names |= {f"l_{bare(n)}": value for n, value in zip(model.landmark, landmark, strict=True)}
     names |= {f"n_{bare(n)}": 0.0 for n in model.measurements}
     scope = solved(model, names)

@@ -233,7 +233,10 @@ def not_converging():
     (changed(default_noises=("motion",)), r"no noise of \[motion\], .* jaxslam fit FOLDER --write"),
     (changed(motion=motion.Unicycle(np.zeros((2, 2)))), "the motion of yard has no noise"),
     (changed(robots=(object(),)), "expected the log of one robot"),
-    (changed(motion=motion.BiasedOdometry(np.eye(4))), r"motion: expected .* with bias \[rad/s\], scale"),
+    (
+        changed(motion=motion.BiasedOdometry(np.eye(4))),
+        r"motion: expected .* with bias \[rad/s\], scale",
+    ),
     (not_converging, "the smoothing of yard did not converge"),
     told="twin: .*",
 )
