@@ -24,10 +24,10 @@ from jaxslam.core.types import Log, Scan, Truth
 from jaxslam.math import se2
 from jaxslam.simulation._twin import Twin
 
-HALVES = 20
+PARTS = 20
 """Parts of the log, in time, in each of which a slip is planted."""
 
-WINDOWS = HALVES - 1
+WINDOWS = PARTS - 1
 """Tenths of the log, each of two successive parts, in each of which a slip is looked for."""
 
 
@@ -217,12 +217,12 @@ def _moves(motion: Motion, controls: Float[Array, "T U"]) -> Float[Array, "T 3"]
 def planted_logs(world: Twin, faults: Sequence[Fault], slips: bool) -> tuple[Truth, Log]:
     """The noise-free truth, and the logs (1 + F, …): without a fault, with each, with each slip."""
     dtype, steps = jnp.result_type(float), world.steps
-    count = 1 + len(faults) + HALVES * slips
+    count = 1 + len(faults) + PARTS * slips
     none: PyTree = {name: np.zeros(count, dtype) for name in Amounts._fields}
     none["slip"] = np.zeros((count, steps), dtype)
     for i, fault in enumerate(faults):
         none[fault.name][1 + i] = fault.amount
-    for k in range(HALVES * slips):
+    for k in range(PARTS * slips):
         none["slip"][1 + len(faults) + k, _rows(steps, k, k + 1)] = _SLIP.amount
     nominal = averaged_controls(world)[0].astype(dtype), body_rates(world).astype(dtype)
     truth, logs = _plant(world, columns_of(world), nominal, Amounts(**none))
@@ -235,8 +235,8 @@ def window_rows(steps: int, k: int) -> slice:
 
 
 def _rows(steps: int, first: int, last: int) -> slice:
-    """The rows from part `first` to part `last` of `HALVES`, that excluded."""
-    edges = np.linspace(0, steps, HALVES + 1).round().astype(int)
+    """The rows from part `first` to part `last` of `PARTS`, that excluded."""
+    edges = np.linspace(0, steps, PARTS + 1).round().astype(int)
     return slice(int(edges[first]), int(edges[last]))
 
 
@@ -320,19 +320,19 @@ def shapes_of(
         return Shape(fault, weights, float(np.sum(weights * change)))
 
     changes = innovations[1:] - innovations[0]
-    halves = changes[len(faults) :]
+    parts = changes[len(faults) :]
     if slips:
         # The log of a larger world is one of travel that is recorded too short. Its shape by the
         # odometry alone; that of longer ranges holds the travel of the smoothed path, whose noise
         # was found in the same innovations.
-        shorter = -halves.sum(axis=0)
+        shorter = -parts.sum(axis=0)
         changes = [
             shorter if fault.name == "longer" else change
             for fault, change in zip(faults, changes, strict=False)
         ]
     of_faults = [shape_of(*pair) for pair in zip(faults, changes, strict=False)]
     # To first order a slip of two parts does what one in each does.
-    of_slips = [shape_of(_SLIP, halves[k] + halves[k + 1]) for k in range(WINDOWS * slips)]
+    of_slips = [shape_of(_SLIP, parts[k] + parts[k + 1]) for k in range(WINDOWS * slips)]
     return (
         [shape for shape in of_faults if shape.information > 0],
         of_slips if all(shape.information > 0 for shape in of_slips) else [],
