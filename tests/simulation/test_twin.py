@@ -234,8 +234,12 @@ def not_converging():
     (changed(motion=motion.Unicycle(np.zeros((2, 2)))), "the motion of yard has no noise"),
     (changed(robots=(object(),)), "expected the log of one robot"),
     (
-        changed(motion=motion.BiasedOdometry(np.eye(4))),
-        r"motion: expected .* with bias \[rad/s\], scale",
+        changed(
+            motion=motion.ConstantVelocity(np.eye(2)),
+            log=of_yard()[0].log._replace(control=np.full((60, 1), 0.2)),
+            pose=np.zeros(5),
+        ),
+        r"motion: expected odometry that moves the pose and nothing else.* with v \[m/s\], omega",
     ),
     (not_converging, "the smoothing of yard did not converge"),
     told="twin: .*",
