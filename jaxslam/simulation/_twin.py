@@ -53,7 +53,10 @@ class Twin(World):
 
     What the robot has beside its pose, as a bias, is drawn anew: at the start as the prior says,
     and then as w changes it. u' is that with which the pose comes about, so the odometry of a twin
-    has its own bias.
+    has its own bias. A state that multiplies the odometry, as a scale, is found too small by the
+    share σ²/v² of the noise in the square of the velocity, as always where the odometry, and not
+    the path, is noisy (errors in variables): where that is no small part of its deviation, twins
+    say little of it.
     """
 
     name: str = static()
