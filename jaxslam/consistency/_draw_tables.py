@@ -159,9 +159,7 @@ def run_files(world: World, log: Log) -> Files:
 
 def truth_files(world: World, truth: Truth, log: Log) -> Files:
     """The files of the truth of a run: the robot at each scan, and the landmarks by tag."""
-    rows, path = odometry_of(world, log.control).rows, np.asarray(truth.pose, np.float64)
-    if truth.further is not None:
-        path = np.concatenate([path, np.asarray(truth.further, np.float64)], axis=1)
+    rows, path = odometry_of(world, log.control).rows, np.asarray(truth.robot, np.float64)
     names = (TIME, *POSE, *world.motion.state[3:])
     files = {"truth.csv": _csv(names, [_numbers(rows), *map(_numbers, path.T)])}
     if world.sensor.landmark:

@@ -162,10 +162,7 @@ def folder_source(
     def outcome_of(number: int, truth: Truth, log: Log) -> Outcome:
         name = run_name(number)
         in_file = read_truth(draws.path, name, len(truth.pose), state)
-        drawn = np.asarray(truth.pose, np.float64)
-        if truth.further is not None:
-            drawn = np.concatenate([drawn, np.asarray(truth.further, np.float64)], axis=1)
-        gap = np.abs(in_file.robot - drawn)
+        gap = np.abs(in_file.robot - np.asarray(truth.robot, np.float64))
         gap[:, 2] = np.minimum(gap[:, 2], np.abs(2 * math.pi - gap[:, 2]))
         if not (largest := float(gap.max())) <= _SAME:
             path = draws.path / TRUTH / name / "truth.csv"

@@ -74,11 +74,6 @@ WORLDS = {
 }
 
 
-def robots_of(truth):
-    """The true numbers of the robot (T, R), beside the pose, too."""
-    return truth.pose if truth.further is None else np.c_[truth.pose, truth.further]
-
-
 def test_draws_are_the_worlds_of_a_campaign():
     for world, runs in ((CIRCLE, 18), (scenarios.cloister(6), 2)):
         histories = list(draws(world, runs, KEY))
@@ -127,13 +122,13 @@ def test_a_filter_on_the_tables_has_the_nees_of_the_campaign(name, tmp_path):
     write_draws(world, 2, KEY, tmp_path / "draws")
     data, true = folder_of(tmp_path / "draws", 1)
     truth, log = list(draws(world, 2, KEY))[1]
-    np.testing.assert_array_equal(true[:, 1:], robots_of(truth))
+    np.testing.assert_array_equal(true[:, 1:], truth.robot)
     table_ekf = EkfSlam(data.motion, data.sensor, data.capacity, **data.filter_options)
     rows = np.searchsorted(data.time, true[:, 0])
     np.testing.assert_array_equal(data.time[rows], true[:, 0])
-    read = nees_of(table_ekf, data.log, (data.pose, data.pose_cov), robots_of(truth), rows)
+    read = nees_of(table_ekf, data.log, (data.pose, data.pose_cov), truth.robot, rows)
     ekf = jaxslam.catalog.FILTERS["ekf"](world)
-    expected = nees_of(ekf, log, (world.pose, world.pose_cov), robots_of(truth))
+    expected = nees_of(ekf, log, (world.pose, world.pose_cov), truth.robot)
     np.testing.assert_array_equal(read.regular, expected.regular)
     assert expected.regular.sum() >= 2
     np.testing.assert_allclose(read.value, expected.value, rtol=1e-9, atol=1e-9)

@@ -55,8 +55,9 @@ class Columns(NamedTuple, Generic[_Name]):
 
     def values(self, names: Sequence[str]) -> np.ndarray:
         """Some columns side by side, (K, len(names))."""
-        rows = len(self.columns[TIME])
-        return np.column_stack([np.zeros((rows, 0)), *(self.columns[name] for name in names)])
+        if not names:  # of a robot without odometry
+            return np.zeros((len(self.columns[TIME]), 0))
+        return np.column_stack([self.columns[name] for name in names])
 
 
 class Seen(NamedTuple, Generic[_Name]):
