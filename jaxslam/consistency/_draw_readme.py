@@ -343,9 +343,9 @@ def _is_number(value: object) -> bool:
 def _noise(model: Motion | Sensor, names: tuple[str, ...], symbol: str) -> str:
     """The covariance of a model's noise, as numbers or as equations."""
     if isinstance(model, Augmented):
-        own, walks = model.motion.noises, names[len(model.motion.noises) :]
+        moves, walks = model.motion.noises, names[len(model.motion.noises) :]
         variance = "sigma**2*dt" if INTERVAL in model.controls else "sigma**2"
-        return f"{_noise(model.motion, own, symbol)}\n\n{_sigmas(walks, model.noise, variance)}"
+        return f"{_noise(model.motion, moves, symbol)}\n\n{_sigmas(walks, model.noise, variance)}"
     bare = [f"{symbol}_{label(name)}" for name in names]
     units = [split_unit(name)[1] or "" for name in names]
     while isinstance(inner := getattr(model, "motion", getattr(model, "sensor", None)), Model):

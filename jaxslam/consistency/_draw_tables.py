@@ -203,7 +203,7 @@ def _motion_sections(
     world: World, odometry: Odometry
 ) -> tuple[dict[str, object], dict[str, object]]:
     """The sections of the motion and of the states beside the pose; the latter {} without any."""
-    model = whole = single_motion(world)
+    model = line_motion = single_motion(world)
     errors: dict[str, object] = {}
     states: tuple[str, ...] = ()
     unit = "1"
@@ -216,14 +216,16 @@ def _motion_sections(
     # The reader makes states of errors of the odometry alone, beside no other, in units of 1.
     readable = not states or (not further and set(states) <= errors.keys() and unit == "1")
     if name is None or not readable:
-        return {"model": f"{whole.name}: {_UNSAID}"}, {}
+        return {"model": f"{line_motion.name}: {_UNSAID}"}, {}
     noise, walks = _motion_deviations(model, odometry)
     section = {"model": name, "noise": noise} | _arguments(model)
     section |= {key: value for key, value in errors.items() if key not in states}
     if not (states or further):
         return section, {}
-    if isinstance(whole, motion.Augmented):
-        walks = np.broadcast_to(np.asarray(whole.noise, np.float64), (len(whole.state) - 3,))
+    if isinstance(line_motion, motion.Augmented):
+        walks = np.broadcast_to(
+            np.asarray(line_motion.noise, np.float64), (len(line_motion.state) - 3,)
+        )
     cov = np.asarray(world.pose_cov, np.float64)
     correlated = np.any(cov[3:, :3]) or np.any(cov[3:, 3:] - np.diag(np.diag(cov)[3:]))
     return section, {
@@ -241,7 +243,7 @@ def _motion_deviations(model: Motion, odometry: Odometry) -> tuple[object, objec
     line's own.
     """
     cov, dt = model.noise_cov, odometry.intervals
-    own = len(model.state) - 3  # whose rates are the last noises
+    beside = len(model.state) - 3  # whose rates are the last noises
     line = np.median(np.diff(odometry.time)) if dt.size else 1.0
     if isinstance(cov, motion.WhiteNoise) and not np.any(cov.turn_share):
         deviations: object = np.array([cov.travel, cov.turn], np.float64) / np.sqrt(line)
@@ -252,11 +254,11 @@ def _motion_deviations(model: Motion, odometry: Odometry) -> tuple[object, objec
         deviations = _UNSAID
     else:
         deviations = _deviations(cov.cov)
-    if not own:
+    if not beside:
         return deviations, None
     if not isinstance(deviations, np.ndarray):
         return deviations, deviations
-    measured = len(model.noises) - own
+    measured = len(model.noises) - beside
     return deviations[:measured] if measured else None, deviations[measured:] * np.sqrt(line)
 
 

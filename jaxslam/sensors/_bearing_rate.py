@@ -77,8 +77,7 @@ class BearingRate(PolarWithRate):
         if self.mount is None:
             return jnp.array([[1, 0], [0, 0]], robot.dtype)
         a, b, gamma = jnp.asarray(self.mount, robot.dtype)
-        one, zero = jnp.ones_like(a), jnp.zeros_like(a)
-        in_robot = jnp.stack([jnp.stack([one, -b]), jnp.stack([zero, a])])
+        in_robot = jnp.stack([jnp.stack([jnp.ones_like(b), -b]), jnp.stack([jnp.zeros_like(a), a])])
         return se2.rotation(gamma).T @ in_robot
 
 

@@ -350,6 +350,27 @@ def test_a_model_of_ones_own_is_written_and_named_where_settings_cannot_say_it(t
         datasets.table(run)
 
 
+def test_states_that_settings_cannot_say_are_named(tmp_path):
+    world = worlds.gyroscope(3)
+    tied = np.array(world.pose_cov)
+    tied[3, 4] = tied[4, 3] = 1e-4
+    both = dataclasses.replace(
+        world,
+        motion=motion.Augmented(motion.Corrected(world.motion), "heading", noise=0.01),
+        pose=(*world.pose, 0.0),
+        pose_cov=np.diag([*np.diag(tied), 0.01]),
+    )
+    for name, changed, unsaid, reason in (
+        ("tied", dataclasses.replace(world, pose_cov=tied), "[state] start_noise", "expected 2"),
+        ("both", both, "[motion] model", "expected one of"),
+    ):
+        (run,) = write_draws(changed, 1, KEY, tmp_path / name)
+        readme = (tmp_path / name / "README.md").read_text()
+        assert f"`dataset.toml` cannot say {unsaid}, so" in readme
+        with pytest.raises(ValueError, match=re.escape(f"{unsaid}: ") + reason):
+            datasets.table(run)
+
+
 def test_noises_and_errors_that_settings_can_say(tmp_path):
     white = motion.Unicycle(motion.WhiteNoise(0.02, 0.03))
     uneven = np.array(CIRCLE.controls)
