@@ -61,8 +61,8 @@ LEAST = 20
 """Least number of twins: with fewer their spread is not known."""
 
 _LOST = 1.5
-"""NIS / dof of the twins, or its inverse, from which on a filter is lost: an honest filter has 1, and
-so has an EKF whose pose NEES is three times too large (*Lost in the woods*)."""
+"""NIS / dof of the twins, or its inverse, from which on a filter is lost: an honest filter has 1,
+and so has an EKF whose pose NEES is three times too large (*Lost in the woods*)."""
 
 _PLANTED = 28
 """Logs with planted faults, which are one block if that is not larger than those of twins."""

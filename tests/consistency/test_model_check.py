@@ -11,10 +11,10 @@ from cases import refused
 from scipy import stats
 
 from jaxslam import catalog, sensors
+from jaxslam.consistency import CheckedStatistic, ModelCheck, check_models
 from jaxslam.consistency import _log_statistics as log_statistics
 from jaxslam.consistency import _model_check as model_check
 from jaxslam.consistency import _planted_faults as planted_faults
-from jaxslam.consistency import CheckedStatistic, ModelCheck, check_models
 from jaxslam.core.types import Info, Status
 from jaxslam.results import plot
 from jaxslam.simulation import twin
