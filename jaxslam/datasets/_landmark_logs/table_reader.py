@@ -20,11 +20,8 @@ from jaxslam.core.protocols import Motion, Sensor
 from jaxslam.core.types import Log
 from jaxslam.core.validation import InvalidFile
 from jaxslam.datasets._dataset import Adjustable, Dataset, Parameter
-from jaxslam.datasets._landmark_logs.table_settings import (
-    UNMEASURED,
-    Parametric,
-    TableSettings,
-)
+from jaxslam.datasets._landmark_logs.table_models import Parametric
+from jaxslam.datasets._landmark_logs.table_settings import UNMEASURED, TableSettings
 from jaxslam.datasets._lines import DIGITS, LARGEST, none_left, read_bytes, stored_file
 from jaxslam.math._odometry_jumps import step_sizes
 from jaxslam.simulation.spurious import Spurious
@@ -377,13 +374,15 @@ def table(folder: str | Path, *, fitted: bool = True) -> Dataset:
     # Times that go back, or a median of 0, are refused when the tables are aligned.
     by_motion = settings.motion(odometry_file.header, abs(interval) or 1.0)
     by_sensor = settings.sensor(measurement_file.header)
-    motion, sensor, delay = by_motion.model, by_sensor.model, settings.delay()
+    motion, sensor = by_motion.model, by_sensor.model
+    of_log = settings.read("sensor", "delay", "max_range", "outliers")
+    of_log |= settings.read("filter", "start", "spacing")
+    delay, max_range = of_log["delay"], of_log["max_range"]
     odometry_names = (TIME, *tables.odometry_columns(motion.controls, odometry_file.header))
     measurement_names = tables.measurement_columns(sensor.measurements, sensor.landmark)
     odometry = odometry_file.table(odometry_names, f"of the motion model {motion.name}")
     measurements = measurement_file.table(measurement_names, f"of the sensor {sensor.name}")
     measurements.columns[TIME] = measurements.columns[TIME] - delay
-    max_range, spacing = settings.max_range(), settings.spacing()
     notes = [file.dialect for file in (odometry_file, measurement_file) if file.dialect]
     notes += [
         f"column {column!r} of {file.path.name} is not used"
@@ -406,9 +405,12 @@ def table(folder: str | Path, *, fitted: bool = True) -> Dataset:
                 "it where it met nothing, set [sensor] max_range"
             )
     survey = _survey(folder / "landmarks.csv", notes)
+    seen = tables.Seen(
+        measurements, sensor.measurements, max_range=max_range, spacing=of_log["spacing"]
+    )
     rows, tags, dropped = tables.align_tables(
         odometry,
-        [tables.Seen(measurements, sensor.measurements, max_range=max_range, spacing=spacing)],
+        [seen],
         motion.controls,
         tuple(survey or ()),
     )
@@ -422,7 +424,7 @@ def table(folder: str | Path, *, fitted: bool = True) -> Dataset:
             )
     true_path, true_at, truth_notes = _truth(folder / "truth.csv", rows.time)
     notes += truth_notes
-    start, one_frame = settings.start(), True
+    start, one_frame = of_log["start"], True
     if start is None:
         one_frame = true_at is not None and bool(true_at[0])
         start = true_path[0] if true_path is not None and one_frame else np.zeros(3)
@@ -433,22 +435,23 @@ def table(folder: str | Path, *, fitted: bool = True) -> Dataset:
             f"{', '.join(sensor.measurements)} alone: a filter starts each landmark from the prior "
             "[sensor] free; --filters localization takes those of landmarks.csv, and needs none"
         )
-    further, further_cov = settings.further_start()
+    further, further_cov = settings.further_start
     apart = np.zeros((3, len(further)))
     unknown = None in (measurements.tags or ())
-    capacity = settings.capacity(len(tags), unknown)
+    capacity, start_cov, filter_options = settings.filter(len(tags), unknown)
+    named = settings.read("", "name", "source", folder=folder.resolve().name)
     log = Log.from_rows(rows)
     adjustable = _with_parameters(log, rows.time, by_motion, by_sensor, delay)
     return Dataset(
-        name=settings.text("name", folder.resolve().name),
+        name=named["name"],
         log=log,
         time=rows.time,
         motion=motion,
         sensor=sensor,
         tags=tags,
         pose=np.concatenate([start, further]),
-        pose_cov=np.block([[settings.start_cov(), apart], [apart.T, further_cov]]),
-        filter_options=settings.filter_options(unknown),
+        pose_cov=np.block([[start_cov, apart], [apart.T, further_cov]]),
+        filter_options=filter_options,
         landmarks=None if survey is None else np.array([survey[tag] for tag in tags]),
         true_path=true_path,
         true_at=true_at,
@@ -457,9 +460,9 @@ def table(folder: str | Path, *, fitted: bool = True) -> Dataset:
         adjustable=adjustable._replace(cov=settings.calibration_cov(adjustable.parameters)),
         dropped=dropped,
         assumed=tuple(settings.assumed + notes),
-        default_noises=tuple(dict.fromkeys(settings.default_noises)),
-        spurious=_spurious(settings.outliers(), measurements),
-        source=settings.text("source", ""),
+        default_noises=settings.default_noises,
+        spurious=_spurious(of_log["outliers"], measurements),
+        source=named["source"],
     )
 
 
