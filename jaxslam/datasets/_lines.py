@@ -3,7 +3,7 @@
 import gzip
 import math
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from jaxslam.core.validation import InvalidFile
@@ -34,12 +34,6 @@ def read_bytes(path: str | Path) -> tuple[Path, bytes]:
     except (OSError, EOFError, zlib.error) as problem:
         reason = getattr(problem, "strerror", None) or f"expected a gzip file, but {problem}"
         raise ValueError(f"{file}: cannot be read: {reason}") from problem
-
-
-def none_left(place: object, dropped: Mapping[str, int]) -> ValueError:
-    """The error about a file whose measurements are all left out, with the reasons."""
-    reasons = ", ".join(f"{count:,} {reason}" for reason, count in dropped.items() if count)
-    return ValueError(f"{place}: no measurement is left, of {reasons or 'none in the file'}")
 
 
 class TextFile:

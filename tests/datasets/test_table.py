@@ -333,6 +333,10 @@ def test_a_file_that_is_missing_or_no_text_is_named(tmp_path, name):
         ("filter = 3", ":1: filter: expected a section [filter]"),
         ("# mine\n[sensor]\n[motion]\nnoise = [1]", ":4: [motion] noise: expected 2 numbers"),
         ("[motion\n", "expected TOML: Expected ']'"),
+        ("[motion]\nmodel = 'ackermann'\nwheelbase = -1", ":3: [motion] wheelbase: expected a number above 0, got -1"),
+        ("[sensor]\nacross = 0.1\naxis = 'x'", ":3: [sensor] axis: expected 1 number ([rad]), got 'x'"),
+        ("[calibration]\nparameters = [[1]]", "[calibration] parameters: expected some of motion v [m/s]"),
+        ("name = 3", ":1: name: expected a str, got 3"),
     ],
 )  # fmt: skip
 def test_bad_settings_are_named(tmp_path, toml, reason):
@@ -347,12 +351,34 @@ def test_bad_settings_are_named(tmp_path, toml, reason):
     [
         ("[[motion]]\nnoise = [0.1, 0.1]\n", r"motion: expected a section \[motion\]"),
         ("[motion]\nscale = " + 5000 * "9", "cannot be read: Exceeds the limit"),
+        ("[sensor]\n[motion]\nnoise = [0.1]", r"3: \[motion\] noise: expected 2 numbers"),
+        ("[robot]\nmass = 1", r"1: robot: expected one of name, source, motion"),
     ],
 )
 def test_bad_files_of_fitted_numbers_are_named(tmp_path, toml, reason):
     write(tmp_path, OWN | {"fit.toml": toml})
-    with pytest.raises(ValueError, match=rf"fit\.toml: {reason}"):
+    with pytest.raises(ValueError, match=rf"fit\.toml: ?{reason}"):
         datasets.table(tmp_path)
+
+
+def test_the_page_has_the_keys_that_the_settings_have(tmp_path):
+    """An unknown key is refused with those of its section; the page adds nothing and lacks none."""
+    page = (Path(__file__).parents[2] / "docs/guide/own_data.md").read_text()
+    pages: dict[str, set[str]] = {section: set() for section in ("motion", "sensor", "filter", "state", "calibration")}  # fmt: skip
+    section = None
+    for row in page.splitlines():
+        cell = row.split("|")[1] if row.startswith("| `") else ""
+        heading = re.search(r"\[(\w+)\]", cell)
+        if heading or section == "state":
+            pages[heading[1] if heading else "state"] |= set(re.findall(r"`(?:\[\w+\] )?(\w+)`", cell))  # fmt: skip
+        if not cell and not row.startswith("|---"):
+            section = "state" if row.startswith("| key of `[state]`") else None
+    for name, keys in pages.items():
+        toml = f"[{name}]\nbogus = 1"
+        with pytest.raises(ValueError, match=r"bogus: expected one of") as caught:
+            datasets.table(write(tmp_path, OWN | {"dataset.toml": toml}))
+        listed = str(caught.value).partition("one of ")[2].partition(", the keys of")[0]
+        assert keys == set(listed.split(", "))
 
 
 def test_columns_of_no_model_list_those_of_all(tmp_path):
