@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 
 from jaxslam.core._units import are_headings_in_degrees
 from jaxslam.core.logs._streams import geodesic_poses, known_poses
-from jaxslam.core.logs._tables import POSE, TIME, split_unit
+from jaxslam.core.logs._tables import LATEST, POSE, TIME, split_unit
 from jaxslam.core.validation import InvalidFile
 from jaxslam.datasets._account import Account
 from jaxslam.datasets._csv import CsvTable
@@ -125,7 +125,7 @@ def _path_in_csv(path: Path) -> RecordedPath:
         raise file.error("expected theta [rad] beside a covariance, got theta [deg]")
     columns = file.columns((*wanted, *entries), "of a path", optional=COVARIANCE)
     time = columns.columns[wanted[0]]
-    _check_rising(time, lambda row, reason: columns.error(row, wanted[0], reason))
+    _check_times(time, lambda row, reason: columns.error(row, wanted[0], reason))
     pose = columns.values(wanted[1:])
     account = Account()
     account.correct(file.dialect, file.dialect)
@@ -150,7 +150,7 @@ def _path_in_tum(path: Path) -> RecordedPath:
     if not rows:
         raise file.end_error(f"expected lines {' '.join(TUM)}, got none")
     table = np.array(rows)
-    _check_rising(table[:, 0], lambda row, reason: file.error(numbers[row], reason))
+    _check_times(table[:, 0], lambda row, reason: file.error(numbers[row], reason))
     pose = planar(table[:, 1:])
     if not (finite := np.isfinite(pose).all(axis=1)).all():
         row = int(np.argmin(finite))
@@ -158,8 +158,14 @@ def _path_in_tum(path: Path) -> RecordedPath:
     return _make_path(str(path), table[:, 0], pose, None)
 
 
-def _check_rising(time: Float[np.ndarray, "K"], error: Callable[[int, str], ValueError]) -> None:
-    """Raise ValueError unless times rise. error: (row, reason) -> the error about it."""
+def _check_times(time: Float[np.ndarray, "K"], error: Callable[[int, str], ValueError]) -> None:
+    """Raise ValueError unless times are seconds and rise. error: (row, reason) -> the error."""
+    if late := np.flatnonzero(np.abs(time) > LATEST).tolist():
+        raise error(
+            late[0],
+            f"expected a time in seconds, got {time[late[0]]:.4g}: name the column of a CSV "
+            "t [ns], t [us] or t [ms], or divide",
+        )
     back = np.flatnonzero(np.diff(time) <= 0)
     if back.size:
         before, after = time[back[0] : back[0] + 2].tolist()

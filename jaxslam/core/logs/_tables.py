@@ -286,7 +286,7 @@ DEGREES_OF_PATH = (
     "write [deg]"
 )
 
-_LATEST = 1e11
+LATEST = 1e11
 """Stamp [s] that no clock has; milliseconds since 1970 are above 1e12."""
 
 
@@ -310,7 +310,7 @@ def wrong_units(table: Columns[_Name]) -> list[str]:
             break
     if set(POSE) <= set(table.columns) and are_headings_in_degrees(table.values(POSE)):
         signs.append(table.error(0, POSE[2], DEGREES_OF_PATH))
-    if (when > _LATEST).any():
+    if (when > LATEST).any():
         row = int(np.argmax(when))
         text = (
             f"{when[row]:.6g} s is over three thousand years since 1970: milliseconds, "
