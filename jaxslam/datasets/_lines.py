@@ -6,6 +6,9 @@ import zlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from jaxslam.core.validation import InvalidFile
 
 DIGITS = 18
@@ -83,6 +86,13 @@ class TextFile:
                 if abs(float(field)) > LARGEST:
                     raise self.error(line, f"{name} is beyond ±{LARGEST:g}: {field}")
         return values
+
+    def table(self, names: Sequence[str]) -> tuple[list[int], NDArray[np.float64]]:
+        """The numbers of each line and the number of each; ValueError as `numbers`, and of none."""
+        rows = {line: self.numbers(line, fields, names) for line, fields in self}
+        if not rows:
+            raise self.end_error(f"expected lines {' '.join(names)}, got none")
+        return list(rows), np.array([*rows.values()])
 
     def identity(self, line: int, field: str, name: str) -> int:
         """A field as a whole number >= 0; raises ValueError otherwise."""

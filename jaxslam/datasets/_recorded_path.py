@@ -143,18 +143,13 @@ def _path_in_csv(path: Path) -> RecordedPath:
 
 def _path_in_tum(path: Path) -> RecordedPath:
     file = TextFile(path, comment="#")
-    numbers, rows = [], []
-    for number, fields in file:
-        rows.append(file.numbers(number, fields, TUM))
-        numbers.append(number)
-    if not rows:
-        raise file.end_error(f"expected lines {' '.join(TUM)}, got none")
-    table = np.array(rows)
-    _check_times(table[:, 0], lambda row, reason: file.error(numbers[row], reason))
+    lines, table = file.table(TUM)
+    _check_times(table[:, 0], lambda row, reason: file.error(lines[row], reason))
     pose = planar(table[:, 1:])
     if not (finite := np.isfinite(pose).all(axis=1)).all():
         row = int(np.argmin(finite))
-        raise file.error(numbers[row], f"expected a quaternion of norm 1, got {rows[row][4:]}")
+        got = table[row, 4:].tolist()
+        raise file.error(lines[row], f"expected a quaternion of norm 1, got {got}")
     return _make_path(str(path), table[:, 0], pose, None)
 
 

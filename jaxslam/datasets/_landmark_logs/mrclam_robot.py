@@ -96,19 +96,17 @@ def read_truth(folder: Path, robot: int) -> Float[np.ndarray, "K 4"] | None:
 
 def _read_in_time(file: TextFile, names: tuple[str, ...]) -> Float[np.ndarray, "_ _"]:
     """A table whose first column does not decrease; raises ValueError otherwise."""
-    table: list[list[float]] = []
-    for line, fields in file:
-        values = file.numbers(line, fields, names)
-        if table and values[0] < table[-1][0]:
-            raise file.error(line, f"time goes back from {table[-1][0]} to {values[0]}")
-        if names[1] == "barcode":
+    lines, table = file.table(names)
+    if (back := np.flatnonzero(np.diff(table[:, 0]) < 0)).size:
+        before, after = table[back[0] : back[0] + 2, 0]
+        raise file.error(lines[back[0] + 1], f"time goes back from {before} to {after}")
+    if names[1] == "barcode":
+        for line, fields in file:
             file.identity(line, fields[1], "barcode")
-            if values[2] < 0:
-                raise file.error(line, f"the range {values[2]} is negative")
-        table.append(values)
-    if not table:
-        raise file.end_error("no data in the file")
-    return np.array(table)
+        if (negative := np.flatnonzero(table[:, 2] < 0)).size:
+            row = negative[0]
+            raise file.error(lines[row], f"the range {table[row, 2]} is negative")
+    return table
 
 
 class RobotCalibration(NamedTuple):

@@ -106,14 +106,19 @@ def table(folder: str | Path, *, fitted: bool = True) -> Dataset:
     odometry = odometry_file.columns(odometry_names, f"of the motion model {motion.name}")
     measurements = measurement_file.columns(measurement_names, f"of the sensor {sensor.name}")
     measurements.columns[TIME] = measurements.columns[TIME] - delay
-    notes = [file.dialect for file in (odometry_file, measurement_file) if file.dialect]
+    account = Account()
+    notes = account.corrections
+    notes += [file.dialect for file in (odometry_file, measurement_file) if file.dialect]
     notes += [
         f"column {column!r} of {file.path.name} is not used"
         for file, names in ((odometry_file, odometry_names), (measurement_file, measurement_names))
         for column in file.unused(names)
     ]
-    from_poses = odometry_names[1:] == POSE
-    notes += _odometry_notes(odometry, from_poses)
+    if jump := tables.replace_jumps(odometry):
+        notes.append(jump)
+    is_path = odometry_names[1:] == POSE
+    rule = "no pose is interpolated over" if is_path else "the odometry is taken to hold over"
+    _note_longest_gap(odometry, f"; {rule} it", account)
     notes += [
         f"{sign} in the header"
         for part in (odometry, measurements)
@@ -122,40 +127,37 @@ def table(folder: str | Path, *, fitted: bool = True) -> Dataset:
     if "range [m]" in measurements.columns and not np.isfinite(max_range):
         ranges = measurements.columns["range [m]"]
         largest = int((ranges == ranges.max()).sum())
-        if largest > max(10, _MAX_SHARE_OF_LARGEST * len(ranges)):
-            notes.append(
-                f"{largest:,} ranges are {ranges.max():.6g} m, the largest: if the sensor writes "
-                "it where it met nothing, set [sensor] max_range"
-            )
-    survey = _survey(folder / "landmarks.csv", notes)
+        account.correct(
+            f"{largest:,} ranges are {ranges.max():.6g} m, the largest: if the sensor writes it "
+            "where it met nothing, set [sensor] max_range",
+            largest > max(10, _MAX_SHARE_OF_LARGEST * len(ranges)),
+        )
+    survey = _survey(folder / "landmarks.csv", account)
     seen = tables.Seen(
         measurements, sensor.measurements, max_range=max_range, spacing=of_log["spacing"]
     )
     rows, tags, dropped = tables.align_tables(
-        odometry,
-        [seen],
-        motion.controls,
-        tuple(survey or ()),
+        odometry, [seen], motion.controls, tuple(survey or ())
     )
+    account.dropped.update(dropped)
     if not rows.valid.any():
-        raise Account(dropped).none_left(measurement_file.path, measurement_file.lines[0])
+        raise account.none_left(measurement_file.path, measurement_file.lines[0])
     for row, tag in enumerate(measurements.tags or ()):
         # A tag that is not in the log is measured outside of the odometry alone, and counted.
         if survey is not None and tag in tags and tag not in survey:
             raise measurements.error(row, TAG, f"expected a tag of landmarks.csv, got {tag}")
-    true_path, true_at, truth_notes = _truth(folder / "truth.csv", rows.time)
-    notes += truth_notes
+    true_path, true_at = _truth(folder / "truth.csv", rows.time, account)
     start, one_frame = of_log["start"], True
     if start is None:
         one_frame = true_at is not None and bool(true_at[0])
         start = true_path[0] if true_path is not None and one_frame else np.zeros(3)
         shown = [float(f"{value:.6g}") for value in start]
         notes.append(f"[filter] start = {shown}" + ", the truth at the first row" * one_frame)
-    if sensor.name in UNMEASURED and survey is not None and one_frame:
-        notes.append(
-            f"{', '.join(sensor.measurements)} alone: a filter starts each landmark from the prior "
-            "[sensor] free; --filters localization takes those of landmarks.csv, and needs none"
-        )
+    account.correct(
+        f"{', '.join(sensor.measurements)} alone: a filter starts each landmark from the prior "
+        "[sensor] free; --filters localization takes those of landmarks.csv, and needs none",
+        sensor.name in UNMEASURED and survey is not None and one_frame,
+    )
     further, further_cov = settings.further_start
     apart = np.zeros((3, len(further)))
     unknown = None in (measurements.tags or ())
@@ -199,22 +201,6 @@ def _spurious(outliers: float, measurements: Columns[int | str]) -> Spurious | N
     return Spurious(outliers=outliers, reach=max(distances, default=1.0))
 
 
-def _odometry_notes(odometry: Columns[int | str], from_poses: bool) -> list[str]:
-    """Replace jumps of the path of odometry, if it is one; notes on jumps and gaps.
-
-    from_poses: whether the controls are increments between poses.
-    """
-    notes = []
-    if jump := tables.replace_jumps(odometry):
-        notes.append(jump)
-    if gap := _longest_gap(odometry):
-        rule = (
-            "no pose is interpolated over" if from_poses else "the odometry is taken to hold over"
-        )
-        notes.append(f"{gap}; {rule} it")
-    return notes
-
-
 def _with_parameters(
     log: Log,
     time: np.ndarray,
@@ -237,23 +223,22 @@ def _with_parameters(
     return Adjustable(parameters, at)
 
 
-def _longest_gap(table: Columns[int | str]) -> str:
-    """The place and the length of the longest gap between lines; empty without one."""
+def _note_longest_gap(table: Columns[int | str], rule: str, account: Account) -> None:
+    """Note the place and the length of the longest gap between lines, if there is one."""
     clock = table.columns[TIME]
-    if not is_gap(clock).any():
-        return ""
-    steps = np.diff(clock)
-    k = int(np.argmax(steps))
-    text = f"{steps[k]:.6g} s since the line before, the median is {np.median(steps):.6g} s"
-    return str(table.error(k + 1, TIME, text))
+    if is_gap(clock).any():
+        steps = np.diff(clock)
+        k = int(np.argmax(steps))
+        text = f"{steps[k]:.6g} s since the line before, the median is {np.median(steps):.6g} s"
+        account.correct(str(table.error(k + 1, TIME, text + rule)))
 
 
-def _survey(path: Path, notes: list[str]) -> dict[int | str, tuple[float, float]] | None:
-    """The position of each tag, and notes added; None without a file."""
+def _survey(path: Path, account: Account) -> dict[int | str, tuple[float, float]] | None:
+    """The position of each tag; None without a file."""
     if stored_file(path) is None:
         return None
     file = CsvTable(path)
-    notes += [file.dialect] if file.dialect else []
+    account.correct(file.dialect, file.dialect)
     columns = file.columns((TAG, *POSE[:2]), "of landmarks")
     survey: dict[int | str, tuple[float, float]] = {}
     for row, tag in enumerate(columns.tags or ()):
@@ -264,10 +249,12 @@ def _survey(path: Path, notes: list[str]) -> dict[int | str, tuple[float, float]
     return survey
 
 
-def _truth(path: Path, time: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None, list[str]]:
-    """The true pose at each row (T, 3), a mask of the rows that have one (T,), and notes."""
+def _truth(
+    path: Path, time: np.ndarray, account: Account
+) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """The true pose at each row (T, 3), and a mask of the rows that have one (T,)."""
     if stored_file(path) is None:
-        return None, None, []
+        return None, None
     file = CsvTable(path)
     columns = file.columns((TIME, *POSE), "of a true path", optional=POSE)
     tables.check_times(columns, strict=True)
@@ -276,11 +263,10 @@ def _truth(path: Path, time: np.ndarray) -> tuple[np.ndarray | None, np.ndarray 
         within = f"{time[0]:.12g} to {time[-1]:.12g}, got {clock[0]:.12g} to {clock[-1]:.12g}"
         raise columns.error(0, TIME, f"expected times within those of the log, {within}")
     true_path, true_at = known_poses(clock, pose, time)
-    notes = [file.dialect] if file.dialect else []
-    if lost := int((~np.isfinite(pose).all(axis=1)).sum()):
-        notes.append(f"{file.path.name}: {lost:,} of {len(pose):,} lines have no pose")
-    if gap := _longest_gap(columns):
-        notes.append(f"{gap}: no pose is interpolated over it")
+    account.correct(file.dialect, file.dialect)
+    lost = int((~np.isfinite(pose).all(axis=1)).sum())
+    account.correct(f"{file.path.name}: {lost:,} of {len(pose):,} lines have no pose", lost)
+    _note_longest_gap(columns, ": no pose is interpolated over it", account)
     jump, repeated = true_path_faults(clock, pose)
     if jump.any():
         k = int(np.argmax(jump))
@@ -291,13 +277,14 @@ def _truth(path: Path, time: np.ndarray) -> tuple[np.ndarray | None, np.ndarray 
         )
         if repeated.any():
             text += f"; {int(repeated.sum()):,} lines beside jumps repeat a pose and are not used"
-        notes.append(str(columns.error(k, POSE[0], text)))
-    if unknown := int((~true_at).sum()):
-        notes.append(
-            f"{unknown:,} of {len(time):,} rows have no true pose: before the first or after the "
-            f"last line of {file.path.name}, in a gap or a jump of it, or beside a line without a "
-            "pose"
-        )
-    if are_headings_in_degrees(pose):
-        notes.append(f"{file.path.name}: {tables.DEGREES_OF_PATH} in the header")
-    return true_path, true_at, notes
+        account.correct(str(columns.error(k, POSE[0], text)))
+    unknown = int((~true_at).sum())
+    account.correct(
+        f"{unknown:,} of {len(time):,} rows have no true pose: before the first or after the last "
+        f"line of {file.path.name}, in a gap or a jump of it, or beside a line without a pose",
+        unknown,
+    )
+    account.correct(
+        f"{file.path.name}: {tables.DEGREES_OF_PATH} in the header", are_headings_in_degrees(pose)
+    )
+    return true_path, true_at

@@ -155,6 +155,10 @@ def _has_both(sensor: Sensor) -> bool:
     return sensor.measurements == ("range [m]", "bearing [rad]")
 
 
+def _has_axis(sensor: Sensor) -> bool:
+    return _has_range(sensor) and "bearing [rad]" in sensor.measurements
+
+
 def _has_mount(sensor: Sensor) -> bool:
     return "mount" in inspect.signature(type(sensor)).parameters
 
@@ -187,7 +191,7 @@ SCHEMA = {
         Key("mount", numbers, POSE, [0.0, 0.0, 0.0], note=True, of=_has_mount),
         # `range` can always be fitted, the axis only where the file states it.
         Key("range", numbers, ("scale", "offset [m]"), [1.0, 0.0], _scales(1), of=_has_range),
-        Key("axis", numbers, ("[rad]",), of=_has_range),
+        Key("axis", numbers, ("[rad]",), of=_has_axis),
         Key("share", number, ("[1]",), 0.0, toml.not_negative, of=_has_both),
         Key("delay", number, ("[s]",), 0.0),
         Key("max_range", number, ("[m]",), np.inf, toml.not_negative),
@@ -331,8 +335,7 @@ class TableSettings(toml.SettingsFile):
 
         def corrected(p: JaxOrNumPy) -> Sensor:
             axis = p[at["sensor", "axis"]][0] if "axis" in stated else None
-            errors = {"range": p[at["sensor", "range"]], "axis": axis}
-            return self._build("sensor", sensors.Corrected, uncorrected(p), errors)
+            return sensors.Corrected(uncorrected(p), p[at["sensor", "range"]], axis)
 
         can_err = ("sensor", "range") in at
         has_error = not stated.keys().isdisjoint(_RANGE_ERRORS)
@@ -403,32 +406,23 @@ class TableSettings(toml.SettingsFile):
         self.keys[section] = (*SCHEMA[section], *of_arguments)
         values = self.read(section, *(key.name for key in of_arguments))
         options = {key: value for key, value in values.items() if key in self.stated(section)}
-        bare = self._build(section, registry[name], of_no_noise, options)
+
+        def build(noise: object, **further: Any) -> _Model:
+            try:
+                with warnings.catch_warnings():  # a mount beyond 2π is noted
+                    warnings.filterwarnings("ignore", message=".*beyond 2π")
+                    return registry[name](noise, **options, **further)
+            except (ValueError, TypeError) as problem:
+                if isinstance(problem, InvalidField) and problem.field in options:
+                    raise self.error(section, problem.field, problem.reason) from problem
+                raise InvalidFile(self.path, f"[{section}] {problem}") from problem
+
+        bare = build(of_no_noise)
         of_model = (key for key in self.keys[section] if key.of is None or key.of(bare))
         self.keys[section] = tuple(of_model)
         self.refuse_unknown(section, f", the keys of {name}")
 
-        def build(noise: object, **further: Any) -> _Model:
-            return self._build(section, registry[name], noise, options | further)
-
         return bare, build
-
-    def _build(
-        self,
-        section: str,
-        factory: Callable[..., _Model],
-        first: object,
-        options: Mapping[str, Any],
-    ) -> _Model:
-        """The model of its first argument and of options in the section."""
-        try:
-            with warnings.catch_warnings():  # a mount beyond 2π is noted
-                warnings.filterwarnings("ignore", message=".*beyond 2π")
-                return factory(first, **options)
-        except (ValueError, TypeError) as problem:
-            if isinstance(problem, InvalidField) and problem.field in options:
-                raise self.error(section, problem.field, problem.reason) from problem
-            raise InvalidFile(self.path, f"[{section}] {problem}") from problem
 
     def _parameters(
         self, section: str, names: Sequence[str], without: Sequence[str] = ()

@@ -253,15 +253,10 @@ def relation_file(path: str | Path) -> StampedRelations:
     (z, roll or pitch above 1e-6), and a file without relations.
     """
     file = TextFile(path, comment="#")
-    rows = []
-    for line, fields in file:
-        row = file.numbers(line, fields, _FIELDS)
-        for name, value in zip(_FIELDS[4:7], row[4:7], strict=True):
-            if abs(value) > _FLAT:
-                raise file.error(line, f"expected a pose in the plane, with {name} 0, got {value}")
-        rows.append(row)
-    if not rows:
-        raise file.end_error(f"expected lines {' '.join(_FIELDS)}, got none")
-    table = np.array(rows)
+    lines, table = file.table(_FIELDS)
+    if (off := np.argwhere(np.abs(table[:, 4:7]) > _FLAT)).size:
+        row, column = off[0]
+        reason = f"with {_FIELDS[4 + column]} 0, got {table[row, 4 + column]}"
+        raise file.error(lines[row], f"expected a pose in the plane, {reason}")
     pose = np.stack([table[:, 2], table[:, 3], wrapped(table[:, 7])], axis=1)
     return StampedRelations(table[:, 0], table[:, 1], pose, str(file.path))
