@@ -10,6 +10,7 @@ from benchmarks.gate import Metric
 from benchmarks.real_data import DATA
 from jaxslam.core.logs._streams import interpolate_poses
 from jaxslam.datasets import MRCLAM_CALIBRATION, RobotCalibration
+from jaxslam.datasets._account import Account
 from jaxslam.datasets._landmark_logs.mrclam_robot import read_landmarks, read_robot, read_truth
 
 RATE = 50.0
@@ -29,7 +30,7 @@ TOLERANCE = 0.05, 0.01
 def camera(folder: Path, robot: int, turned: bool) -> tuple[np.ndarray, float, np.ndarray]:
     """(depth, ahead, yaw, axis), the time from a measurement to the truth, and the residuals'
     deviations. Unless turned, yaw and axis are zero. Misread barcodes are left out."""
-    subject_of, names, points, _ = read_landmarks(folder, errata=True)
+    subject_of, names, points = read_landmarks(folder, True, Account())
     truth, (_, seen) = read_truth(folder, robot), read_robot(folder, robot)
     index = [names.index(s) if (s := subject_of.get(int(b))) in names else -1 for b in seen[:, 1]]
     which = np.array(index)
