@@ -70,14 +70,6 @@ def _average(average: Average | None, level: float) -> Cell | None:
     return Cell(average_text(average), average, title)
 
 
-def _verdict(summary: Summary) -> Cell:
-    """The cell of a verdict, with the tests that rejected, and an asterisk if it has doubts."""
-    tests = [TESTS[name].removeprefix("pose ").removesuffix(" / dof") for name in summary.by]
-    rejected = f" ({', '.join(tests)})" * bool(tests)
-    text = summary.verdict + rejected + "*" * bool(summary.doubts)
-    return Cell(text, html=badge(summary.verdict, summary))
-
-
 def badge(verdict: str, summary: Summary | None = None) -> str:
     """A verdict as HTML, with the tests that rejected; with doubts it has an asterisk, and is grey
     if consistent."""
@@ -97,9 +89,18 @@ def short(value: float, digits: int = 4) -> str:
 
 
 def table_of(campaign: Campaign) -> Table:
-    """The table of the filters, without measures that none of them has."""
+    """The table of the filters, without measures that none of them has.
+
+    A verdict has the tests that rejected, and an asterisk if it has doubts.
+    """
     names, summaries = list(campaign.filters), list(campaign.filters.values())
-    rows = [Row("verdict", ["consistent", *map(_verdict, summaries)])]
+    verdicts = []
+    for summary in summaries:
+        tests = [TESTS[name].removeprefix("pose ").removesuffix(" / dof") for name in summary.by]
+        rejected = f" ({', '.join(tests)})" * bool(tests)
+        text = summary.verdict + rejected + "*" * bool(summary.doubts)
+        verdicts.append(Cell(text, html=badge(summary.verdict, summary)))
+    rows = [Row("verdict", ["consistent", *verdicts])]
 
     def add(
         label: str,
