@@ -87,14 +87,11 @@ def text_of(
     first = 1 + table.fixed
     parts: list[list[int]] = []
     for column in range(first, len(widths)):
-        beside = [*range(first), *(parts[-1] if parts else ()), column]
-        fits = (
-            len(beside) - first <= (most or len(widths))
-            if terminal is None
-            else sum(widths[i] + 2 for i in beside) - 2 <= terminal
-        )
+        part = [*(parts[-1] if parts else ()), column]
+        width = sum(widths[i] + 2 for i in [*range(first), *part]) - 2
+        fits = len(part) <= (most or len(widths)) if terminal is None else width <= terminal
         if parts and fits:
-            parts[-1].append(column)
+            parts[-1] = part
         else:
             parts.append([column])
     shown = []

@@ -1,18 +1,19 @@
 """The tables of a campaign and of two filters in pairs, and notes on their terms."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from html import escape
 
 import numpy as np
 
 from jaxslam.consistency import Average, PairedDifference, Summary
 from jaxslam.consistency._intervals import EACH, LEVEL, is_lopsided, percentage
-from jaxslam.consistency._measures import REGISTRY, measures_of
+from jaxslam.consistency._measures import REGISTRY, Measure, measures_of
 from jaxslam.consistency._measures.counts import MEANINGS, count_label
 from jaxslam.consistency._measures.nees import DOF
 from jaxslam.consistency._verdict import TESTS
 from jaxslam.consistency.campaign import Campaign, Comparison
-from jaxslam.core._table import Cell, MaybeCell, Row, Table
+from jaxslam.core._table import Cell, Row, Table
 from jaxslam.math.stats import normal_quantile
 
 VERDICTS = {
@@ -70,6 +71,15 @@ def _average(average: Average | None, level: float) -> Cell | None:
     return Cell(average_text(average), average, title)
 
 
+def _numbers(values: Iterable[float | None], text: Callable[[float], str]) -> list[Cell | None]:
+    """The cells of numbers; none where there is no number."""
+    return [None if value is None else Cell(text(value), [value]) for value in values]
+
+
+def _honest(measure: Measure) -> str:
+    return "" if measure.honest is None else f"{measure.honest:g}"
+
+
 def badge(verdict: str, summary: Summary | None = None) -> str:
     """A verdict as HTML, with the tests that rejected; with doubts it has an asterisk, and is grey
     if consistent."""
@@ -101,48 +111,36 @@ def table_of(campaign: Campaign) -> Table:
         text = summary.verdict + rejected + "*" * bool(summary.doubts)
         verdicts.append(Cell(text, html=badge(summary.verdict, summary)))
     rows = [Row("verdict", ["consistent", *verdicts])]
-
-    def add(
-        label: str,
-        cells: Sequence[MaybeCell],
-        *,
-        honest: str = "",
-        unit: str = "",
-        group: str = "",
-    ) -> None:
-        if any(cell is not None for cell in cells):
-            rows.append(Row(label, [honest, *cells], unit, group=group))
-
     for measure in measures_of(key for s in summaries for key in s.measures):
         if measure.row:
             cells = [_average(s.measures.get(measure.key), EACH) for s in summaries]
-            honest = "" if measure.honest is None else f"{measure.honest:g}"
-            add(measure.label, cells, honest=honest, unit=measure.unit)
-            published = (campaign.published.get(name, {}).get(measure.key) for name in names)
-            add("  published", [None if p is None else Cell(short(p), [p]) for p in published])
+            rows.append(Row(measure.label, [_honest(measure), *cells], measure.unit))
+            published = [campaign.published.get(name, {}).get(measure.key) for name in names]
+            rows.append(Row("  published", ["", *_numbers(published, short)]))
     # The bands of honest filters, and the share of steps within them.
     nis = [s.nis_band and "[{:.4f}, {:.4f}]".format(*s.nis_band) for s in summaries]
     half_widths = [s.autocorrelation_band[0] for s in summaries]
     white = [f"± {half:.4f}" if np.isfinite(half) else None for half in half_widths]
     for name, bands in (("NIS / dof", nis), ("autocorrelation", white)):
-        add(f"{name}, {percentage(LEVEL)} band", bands, group="Bands")
+        rows.append(Row(f"{name}, {percentage(LEVEL)} band", ["", *bands], group="Bands"))
     for block in DOF:
-        shares = (s.inside.get(block) for s in summaries)
-        cells = [None if p is None else Cell(percentage(p, 1), [p]) for p in shares]
-        add(f"steps in {block} band", cells, honest=percentage(LEVEL, 1), group="Bands")
+        shares = _numbers([s.inside.get(block) for s in summaries], partial(percentage, digits=1))
+        honest = percentage(LEVEL, 1)
+        rows.append(Row(f"steps in {block} band", [honest, *shares], group="Bands"))
     # Times, and counts that are not 0 for all filters.
-    for label, seconds, scale, unit in (
-        ("time of a step", campaign.step_seconds, 1e6, "µs"),
-        ("wall time of a run", campaign.run_seconds, 1.0, "s"),
+    steps = {name: 1e6 * seconds for name, seconds in campaign.step_seconds.items()}
+    for label, of, unit in (
+        ("time of a step", steps, "µs"),
+        ("wall time of a run", campaign.run_seconds, "s"),
     ):
-        times = [scale * seconds[name] if name in seconds else None for name in names]
-        cells = [None if t is None else Cell(f"{t:.3g}", [t]) for t in times]
-        add(label, cells, unit=unit, group="Time and counts")
+        times = _numbers([of.get(name) for name in names], "{:.3g}".format)
+        rows.append(Row(label, ["", *times], unit, group="Time and counts"))
     for key in dict.fromkeys(key for s in summaries for key in s.counts):
-        numbers = [s.counts.get(key) for s in summaries]
-        if key not in _NEVER and (key in _ALWAYS or any(numbers)):
-            cells = [None if n is None else Cell(f"{n:,}", [n]) for n in numbers]
-            add(count_label(key), cells, group="Time and counts")
+        counts = [s.counts.get(key) for s in summaries]
+        if key not in _NEVER and (key in _ALWAYS or any(counts)):
+            numbers = _numbers(counts, "{:,}".format)
+            rows.append(Row(count_label(key), ["", *numbers], group="Time and counts"))
+    rows = [row for row in rows if any(cell is not None for cell in row.cells[1:])]
     return Table(["measure", "honest", *names], rows, fixed=1)
 
 
@@ -200,11 +198,10 @@ def table_of_pairs(comparison: Comparison) -> Table:
         measure, share, factor = REGISTRY[key], pair.share, pair.narrower
         times = f"{factor:#.3g}".rstrip(".") if factor < np.inf else "∞"  # all three digits
         cells = [
-            "" if measure.honest is None else f"{measure.honest:g}",
-            Cell(short(pair.first), [pair.first]),
-            Cell(short(pair.second), [pair.second]),
+            _honest(measure),
+            *_numbers([pair.first, pair.second], short),
             _average(pair.difference, LEVEL),
-            None if share is None else Cell(percentage(share), [share]),
+            *_numbers([share], percentage),
             None if np.isnan(factor) else Cell(f"{times} ×", [factor]),
         ]
         rows.append(Row(measure.label, cells, measure.unit))
