@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import least_squares
 
-from benchmarks.gate import Metric
+from benchmarks.gate import Metric, table
 from benchmarks.real_data import DATA
 from jaxslam.core.logs._streams import interpolate_poses
 from jaxslam.datasets import MRCLAM_CALIBRATION, RobotCalibration
@@ -151,10 +151,10 @@ def measure(quick: bool = False) -> list[Metric]:
     if not folder.is_dir():
         print(f"no folder {folder}")
         return []
-    print("| robot 1 of data set 6 | fitted | package |\n| --- | --- | --- |")
-    fields = RobotCalibration._fields
+    rows, fields = [], RobotCalibration._fields
     for name, new, kept in zip(fields, fit(folder), MRCLAM_CALIBRATION, strict=True):
-        print(f"| {name} | {new:.4f} | {kept:.4f} |")
+        rows.append([name, f"{new:.4f}", f"{kept:.4f}"])
         relative, absolute = TOLERANCE
         worst = max(worst, abs(new - kept) / max(relative * abs(kept), relative * absolute))
+    print(table(["robot 1 of data set 6", "fitted", "package"], rows))
     return [Metric("constants off the fit, share of the tolerance", worst, high=1.0)]

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from jaxslam.core._table import csv_text
 from jaxslam.core.logs._tables import label
 from jaxslam.core.types import Estimate, Info, Status
-from jaxslam.results._files import csv_text
 
 __all__ = ["innovations_csv", "map_csv", "trajectory_csv", "trajectory_tum"]
 
