@@ -151,7 +151,7 @@ def test_fit_finds_the_walk_of_a_state(tmp_path, capsys):
             '"odometry"',
             r"\[state\] names: expected some of scale, wheels, heading|expected",
         ),
-        ('"biased_odometry"', '"constant_velocity"', "names: expected v, omega, the states of"),
+        ('"biased_odometry"', '"constant_velocity"', "names: expected some of v, omega, got"),
     ],
 )
 def test_settings_that_do_not_fit_are_refused(tmp_path, old, new, reason):

@@ -236,12 +236,8 @@ class TableSettings(toml.SettingsFile):
             self.refuse_unknown(section)
         self.further_start = np.zeros(0), np.zeros((0, 0))
         """the further states (E,) before the first row, and their covariance (E, E)"""
-
-    @property
-    def default_noises(self) -> tuple[str, ...]:
-        """The sections without a noise."""
-        sections = ("motion", "sensor")
-        return tuple(name for name in sections if "noise" not in self.stated(name))
+        self.default_noises: tuple[str, ...] = ()
+        """the sections, of those read, whose noise is a default"""
 
     def motion(self, header: Sequence[str], interval: float) -> Parametric[Motion]:
         """The motion model; its noise is the noise of a line of odometry, however rows divide it.
@@ -435,6 +431,8 @@ class TableSettings(toml.SettingsFile):
         keys = [key for key in self.keys[section] if key.name in _OF_PARAMETERS]
         if not names:  # of a robot without odometry
             keys = [key for key in keys if key.name != "noise"]
+        elif "noise" not in self.stated(section):
+            self.default_noises += (section,)
         values = self.read(section, *(key.name for key in keys), names=names)
         for key in keys:
             # The names of noises begin with the section, those of errors with the key.
