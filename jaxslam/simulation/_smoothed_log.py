@@ -15,6 +15,7 @@ from jaxslam.core.validation import InvalidField
 from jaxslam.graphs._chain.problem import Iterate, Problem, linearize_at, optimize_chain
 from jaxslam.graphs._solver.search import Ending
 from jaxslam.graphs.smoothing._batch_map import BatchMap
+from jaxslam.linearize._first_order import nominal_path
 from jaxslam.math import _linalg as linalg
 from jaxslam.math._arrays import float64
 from jaxslam.sensors._suite import Suite
@@ -163,7 +164,7 @@ def _from_odometry(data: RecordedLog) -> tuple[SmoothedLog, int, float, int]:
     log: Log = jax.tree.map(np.asarray, data.log)
     start = np.asarray(data.pose, np.float64)
     control = np.asarray(log.control, np.float64)
-    path = np.asarray(jax.device_get(_nominal_path(data.motion, start, control)))
+    path = np.asarray(jax.device_get(nominal_path(data.motion, start, control)))
     valid = np.asarray(log.scan.valid) & (np.asarray(log.scan.tag) >= 0)
     tags = np.unique(np.asarray(log.scan.tag)[valid])
     slot = np.where(valid, np.searchsorted(tags, log.scan.tag), 0)
@@ -198,20 +199,6 @@ def _noise_roots(
 ) -> Float[Array, "T W W"]:
     """The square root of Q of each row."""
     return jax.vmap(linalg.root_psd)(jax.vmap(motion.noise_cov)(before, control))
-
-
-@partial(jax.jit, inline=True)
-def _nominal_path(
-    motion: Motion, start: Float[Array, "3"], control: Float[Array, "T U"]
-) -> Float[Array, "T 3"]:
-    still = jnp.zeros(len(motion.noises), control.dtype)
-
-    def step(pose: Array, u: Array) -> tuple[Array, Array]:
-        pose = motion.step(pose, u, still)
-        return pose, pose
-
-    path: Array = jax.lax.scan(step, start, control)[1]
-    return path
 
 
 def _likeliest_place(

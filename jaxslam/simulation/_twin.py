@@ -162,7 +162,8 @@ def undoing_control(
     damping = float(jnp.finfo(u.dtype).eps) ** 0.75
 
     def gap(u: Array) -> Array:
-        return _difference(target, motion.step(pose, u, w))
+        difference = target - motion.step(pose, u, w)
+        return difference.at[2].set(wrap(difference[2]))
 
     moved = u
     for _ in range(_NEWTON):
@@ -176,12 +177,6 @@ def undoing_control(
         step, _ = linalg.solve_psd(system, jacobian.T @ gap(moved))
         moved = moved + jnp.where(moves, step, 0.0) * changes
     return moved
-
-
-def _difference(a: Float[Array, "X"], b: Float[Array, "X"]) -> Float[Array, "X"]:
-    """a - b with the heading wrapped."""
-    difference = a - b
-    return difference.at[2].set(wrap(difference[2]))
 
 
 def twin(dataset: RecordedLog, *, spurious: Spurious | None = None) -> Twin:

@@ -42,6 +42,7 @@ from jaxslam.core.validation import require
 from jaxslam.datasets import READERS, Dataset
 from jaxslam.datasets._evaluation import Evaluation
 from jaxslam.datasets._landmark_logs.table_settings import METHODS
+from jaxslam.linearize._first_order import nominal_path
 from jaxslam.results import report
 from jaxslam.results._campaign_files import FORMATS, formats_of_figures
 from jaxslam.results._files import Files, Json, json_text, versions
@@ -239,14 +240,8 @@ def _figure(data: Dataset, runs: Mapping[str, FilterRun], formats: tuple[str, ..
 
     (name, first), *others = runs.items()
     evaluation = first.evaluation
-    nominal = jnp.zeros(len(data.motion.noises))
-
-    def step(pose: jax.Array, control: jax.Array) -> tuple[jax.Array, jax.Array]:
-        pose = data.motion.step(pose, control, nominal)
-        return pose, pose
-
-    drive = jax.jit(lambda pose, controls: jax.lax.scan(step, pose, controls)[1])
-    robots = np.asarray(drive(jnp.asarray(data.pose), jnp.asarray(data.log.control)))
+    start, controls = jnp.asarray(data.pose), jnp.asarray(data.log.control)
+    robots = np.asarray(nominal_path(data.motion, start, controls))
     figure = plot.map_figure(
         _path_with_map(first),
         true_points=evaluation.points,
