@@ -145,7 +145,7 @@ class _Pairs(NamedTuple):
     """Σ |w|² v'"""
     later: Array
     """Σ v |w'|²"""
-    count: Array
+    number: Array
     """Σ v v'"""
 
 
@@ -200,7 +200,7 @@ def run_statistics(
             else jnp.zeros_like(before.square),
             earlier=before.square * now.valid[None],
             later=before.valid * now.square[None],
-            count=before.valid * now.valid[None],
+            number=before.valid * now.valid[None],
         )
         sums = _Sums(
             # 0 · x is NaN where x is not finite, and stays so in the sum.

@@ -278,28 +278,23 @@ def _scrolled(label: str, corner: str, head: str, body: str) -> str:
 def _row(row: table.Row) -> str:
     """A row of the table as HTML."""
     kind = ' class="sub"' if row.label.startswith(" ") else ""
-    published = row.published or [None] * len(row.cells)
-    cells = (
-        _cell(cell, value, row.level) for cell, value in zip(row.cells, published, strict=True)
-    )
+    cells = []
+    for cell, published in zip(row.cells, row.published or [None] * len(row.cells), strict=True):
+        title, text = "", escape(_without_breaks(cell_text(cell)))
+        if isinstance(cell, Summary):
+            text = badge(cell.verdict, cell)
+        elif isinstance(cell, Average) and np.isfinite(cell.high):
+            # The pointer on a measure shows its interval.
+            ends = f"{cell.low:.5g} to {cell.high:.5g}"
+            level = percentage(row.level, 1 if row.level == EACH else 0)
+            title = f' title="{_without_breaks(level)} interval {ends}"'
+        if published is not None:
+            text += f'<span class="published">published {short(published)}</span>'
+        cells.append(f"<td{title}>{text}</td>")
     return (
         f'<tr><th scope="row"{kind}>{escape(row.label.strip())}</th>'
         f'<td class="honest">{escape(_without_breaks(row.honest))}</td>{"".join(cells)}</tr>'
     )
-
-
-def _cell(cell: table.Cell, published: float | None, level: float) -> str:
-    """A cell of the table as HTML; the pointer on a measure shows its interval."""
-    title, text = "", escape(_without_breaks(cell_text(cell)))
-    if isinstance(cell, Summary):
-        text = badge(cell.verdict, cell)
-    elif isinstance(cell, Average) and np.isfinite(cell.high):
-        ends = f"{cell.low:.5g} to {cell.high:.5g}"
-        digits = 1 if level == EACH else 0
-        title = f' title="{_without_breaks(percentage(level, digits))} interval {ends}"'
-    if published is not None:
-        text += f'<span class="published">published {short(published)}</span>'
-    return f"<td{title}>{text}</td>"
 
 
 def _without_breaks(text: str) -> str:

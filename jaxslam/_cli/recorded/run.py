@@ -36,7 +36,7 @@ from jaxslam._cli.recorded.filter_choice import (
 from jaxslam._cli.recorded.filter_run import FilterRun, run_filter
 from jaxslam.consistency import ModelCheck
 from jaxslam.consistency._measures.counts import count_label
-from jaxslam.core.protocols import Filter
+from jaxslam.core.protocols import POSE, Filter
 from jaxslam.core.types import Estimate
 from jaxslam.core.validation import require
 from jaxslam.datasets import READERS, Dataset
@@ -181,7 +181,20 @@ def print_summary(summary: Json, runs: Mapping[str, FilterRun]) -> None:
         return
     of_data = {key: value for key, value in summary.items() if key != "filters"}
     print(summary_table({"": of_data}), end="\n\n")
-    print(summary_table({name: _flatten(run.summary) for name, run in runs.items()}))
+    columns = {}
+    for name, run in runs.items():
+        # A row has one value: one row a status that occurs, one a coordinate.
+        status, final = run.summary["status"], run.summary["final pose"]
+        assert isinstance(status, dict)
+        assert isinstance(final, list)
+        rows = {f"{COUNT}{count_label(word)}": count for word, count in status.items() if count}
+        rows |= {
+            key: value
+            for key, value in run.summary.items()
+            if key not in ("status", "final pose", "notes")
+        }
+        columns[name] = rows | {f"final {c}": x for c, x in zip(POSE, final, strict=True)}
+    print(summary_table(columns))
     for name, run in runs.items():
         if notes := run.summary.get("notes"):
             print(summary_table({"": {name: notes}}))
@@ -219,18 +232,6 @@ def write_runs(
     if plan.animate:
         drawings["film"] = lambda: _films(data, runs)
     return write_results(folder, files, drawings, FILMS)
-
-
-def _flatten(summary: Json) -> Json:
-    """The summary as rows of one value: one per status that occurs, one per coordinate."""
-    status, final = summary["status"], summary["final pose"]
-    assert isinstance(status, dict)
-    assert isinstance(final, list)
-    counts = {f"{COUNT}{count_label(name)}": count for name, count in status.items() if count}
-    names = ("x [m]", "y [m]", "theta [rad]")
-    pose = {f"final {n}": value for n, value in zip(names, final, strict=True)}
-    rows = {key: summary[key] for key in summary if key not in ("status", "final pose", "notes")}
-    return counts | rows | pose
 
 
 def _figure(data: Dataset, runs: Mapping[str, FilterRun], formats: tuple[str, ...]) -> Files:
