@@ -219,8 +219,20 @@ def judge_folders(plan: JudgePlan, options: argparse.Namespace, user: UserObject
         (folder,) = plan.folders.values()
         program = Programs(options.estimator, draws, folder, options.time_limit)
         failures = program.run(range(plan.runs), options.processes or cores())
+    names = {run_name(number) for number in range(draws.runs)}
     for folder in plan.folders.values():
-        _check_folder(folder, draws, bool(failures))
+        content = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
+        if further := sorted(n for n in content - names if re.fullmatch(r"\d{4,}", n, re.ASCII)):
+            raise ValueError(
+                f"{folder / further[0]}: {draws.path} has runs {run_name(0)} to "
+                f"{run_name(draws.runs - 1)} alone"
+            )
+        if not content & names and not failures:
+            problem = "holds no estimate" if folder.is_dir() else "is no folder"
+            raise ValueError(
+                f"{folder} {problem}: expected {run_name(0)}/trajectory.csv, and so on, for each "
+                f"run of {draws.path}"
+            )
     measured = plan.world.sensor.measurements
     sources = {
         name: folder_source(folder, draws, measured, options.stride, failures)
@@ -238,20 +250,3 @@ def judge_folders(plan: JudgePlan, options: argparse.Namespace, user: UserObject
             devices=plan.devices,
         )
     return replace(campaign, reference=options.compare or "")
-
-
-def _check_folder(folder: Path, draws: DrawsFolder, may_be_empty: bool) -> None:
-    """Raise ValueError on a folder without the estimate of a run, and on runs without draws."""
-    names = {run_name(number) for number in range(draws.runs)}
-    content = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
-    if further := sorted(n for n in content - names if re.fullmatch(r"\d{4,}", n, re.ASCII)):
-        raise ValueError(
-            f"{folder / further[0]}: {draws.path} has runs {run_name(0)} to "
-            f"{run_name(draws.runs - 1)} alone"
-        )
-    if not content & names and not may_be_empty:
-        problem = "holds no estimate" if folder.is_dir() else "is no folder"
-        raise ValueError(
-            f"{folder} {problem}: expected {run_name(0)}/trajectory.csv, and so on, for each run "
-            f"of {draws.path}"
-        )

@@ -48,7 +48,18 @@ class Programs:
     ) -> None:
         self._command, self._draws, self._estimates = command, draws, estimates
         self._limit = limit
-        self._words = _words_of(command)
+        try:
+            self._words = shlex.split(command)
+        except ValueError as error:
+            raise ValueError(f"--estimator: {command!r}: {error}") from error
+        for place in PLACES:
+            if not any(place in word for word in self._words):
+                raise ValueError(
+                    f"--estimator: expected a command with {PLACES[0]} and {PLACES[1]}, as "
+                    f"'./my_filter {{run}} {{estimate}}', got {command!r}"
+                )
+        if shutil.which(self._words[0]) is None:
+            raise ValueError(f"--estimator: {self._words[0]}: there is no such program")
         # The SHA-256 of each file that the command names, as its program or a script of it.
         self._files = {}
         paths = {word: word for word in self._words[1:]}
@@ -197,20 +208,3 @@ def _kill(process: "subprocess.Popen[bytes]") -> None:
                 os.killpg(process.pid, signal.SIGKILL)
             else:
                 process.kill()
-
-
-def _words_of(command: str) -> list[str]:
-    """The words of a command, which are split as by a shell; ValueError without its places."""
-    try:
-        words = shlex.split(command)
-    except ValueError as error:
-        raise ValueError(f"--estimator: {command!r}: {error}") from error
-    for place in PLACES:
-        if not any(place in word for word in words):
-            raise ValueError(
-                f"--estimator: expected a command with {PLACES[0]} and {PLACES[1]}, as "
-                f"'./my_filter {{run}} {{estimate}}', got {command!r}"
-            )
-    if shutil.which(words[0]) is None:
-        raise ValueError(f"--estimator: {words[0]}: there is no such program")
-    return words
