@@ -266,8 +266,8 @@ def judge_recording(
     if align == "first":
         is_compared[np.argmax(is_known)] = False  # its error is zero by construction
     judged = {name: claims.valid[name] & is_compared for name in DOF}
-    error = aligned.error[is_compared]
-    sigma = claims.sigma()[is_compared]
+    of_poses = time, aligned.error, claims.sigma(), pose, aligned.truth
+    errors = RecordedErrors(*(part[is_compared] for part in of_poses))
     is_outside = (time < clock[0]) | (time > clock[-1])
     left_out = {
         "before the first or after the last time of the truth": is_outside & ~is_known,
@@ -288,7 +288,7 @@ def judge_recording(
     # What qualifies them.
     doubts = list(aligned.notes)
     if align == "none":
-        doubts += _doubt_on_frames(pose[is_compared], true[is_compared])
+        doubts += _doubt_on_frames(errors.pose, errors.truth)
     if cov is None:
         doubts.append("the estimate has no covariance: its errors alone are measured")
     elif not blocks:
@@ -296,11 +296,9 @@ def judge_recording(
     doubts += [note] * bool(note)
     return RecordingScores(
         verdict=_verdict(blocks, int(is_compared.sum())),
-        errors=RecordedErrors(
-            time[is_compared], error, sigma, pose[is_compared], aligned.truth[is_compared]
-        ),
-        rmse=dict(zip(COMPONENTS, np.sqrt((error**2).mean(axis=0)).tolist(), strict=True)),
-        mean={name: mean_of(error[:, k]) for k, name in enumerate(COMPONENTS)},
+        errors=errors,
+        rmse=dict(zip(COMPONENTS, np.sqrt((errors.error**2).mean(axis=0)).tolist(), strict=True)),
+        mean={name: mean_of(errors.error[:, k]) for k, name in enumerate(COMPONENTS)},
         blocks=blocks,
         factors=factors,
         lag=lag,

@@ -148,6 +148,21 @@ class _Pairs(NamedTuple):
     number: Array
     """Σ v v'"""
 
+    @classmethod
+    def of(cls, before: _White, now: _White) -> "_Pairs":
+        """The products of a step with those before it. before: (LAGS, N), now: (N,)."""
+        product = jnp.zeros_like(before.square)
+        if now.w:
+            product = linalg.total(
+                w * w_now[None] for w, w_now in zip(before.w, now.w, strict=True)
+            )
+        return cls(
+            product=product,
+            earlier=before.square * now.valid[None],
+            later=before.valid * now.square[None],
+            number=before.valid * now.valid[None],
+        )
+
 
 class _Sums(NamedTuple):
     poison: Array
@@ -194,21 +209,13 @@ def run_statistics(
         nees, regular = _planar_nees(error, jnp.asarray(estimate.point_covs))
         counts = regular & (held >= 0)
         before, now = sums.recent, _whitened(estimate, info)
-        pairs = _Pairs(
-            product=linalg.total(w * w_now[None] for w, w_now in zip(before.w, now.w, strict=True))
-            if now.w
-            else jnp.zeros_like(before.square),
-            earlier=before.square * now.valid[None],
-            later=before.valid * now.square[None],
-            number=before.valid * now.valid[None],
-        )
         sums = _Sums(
             # 0 · x is NaN where x is not finite, and stays so in the sum.
             poison=sums.poison + 0 * _numbers((estimate, info)),
             recent=jax.tree.map(
                 lambda old, new: jnp.concatenate([new[None], old[:-1]]), before, now
             ),
-            pairs=jax.tree.map(jnp.add, sums.pairs, pairs),
+            pairs=jax.tree.map(jnp.add, sums.pairs, _Pairs.of(before, now)),
         )
         return sums, (jnp.where(counts, nees, 0.0).sum(), counts.sum().astype(dtype))
 
