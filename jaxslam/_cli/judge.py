@@ -3,6 +3,7 @@ covariances that a recorded robot published."""
 
 import argparse
 import re
+import shutil
 import sys
 from collections.abc import Mapping
 from dataclasses import replace
@@ -10,6 +11,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import jax
+import numpy as np
 
 from jaxslam._cli import cache
 from jaxslam._cli.campaigns.estimator_runs import Programs
@@ -26,7 +28,9 @@ from jaxslam.core.protocols import Candidate
 from jaxslam.core.validation import at_least, or_none, positive, require
 from jaxslam.datasets._judged_folders import DrawsFolder, folder_source, read_draws, run_name
 from jaxslam.results import _campaign_files as campaign_files
-from jaxslam.results._campaign_files import FORMATS
+from jaxslam.results import store
+from jaxslam.results._block_files import MANIFEST
+from jaxslam.results._campaign_files import BLOCKS, FORMATS, JUDGED
 from jaxslam.simulation._worlds import World
 
 FOLDER = "estimates"
@@ -147,12 +151,18 @@ def run_judge(options: argparse.Namespace, command: str) -> int:
     jax.config.update("jax_enable_x64", True)
     user = UserObjects()
     plan = plan_of(options, user)
-    campaign = judge_folders(plan, options, user)
+    campaign, columns = judge_folders(plan, options, user)
     print(campaign)
+    # The numbers first: what an interrupted command leaves has no runs of another campaign.
+    blocks = options.out / BLOCKS
+    shutil.rmtree(blocks, ignore_errors=True)
     failed: list[str] = []
     paths = campaign_files.save_campaign(
         campaign, options.out, plan.figures, True, command, None, failed.append
     )
+    kept = store.open(blocks, JUDGED, campaign.runs)
+    kept.claim({"filters": ", ".join(campaign.filters), "steps": str(campaign.steps)})
+    kept.save(0, columns, campaign.runs)
     print("\nwrote " + ", ".join(map(str, paths)))
     for sentence in failed:
         print(f"jaxslam: {sentence}", file=sys.stderr)
@@ -206,14 +216,23 @@ def plan_of(options: argparse.Namespace, user: UserObjects) -> JudgePlan:
                 raise ValueError(f"--compare: expected two {counted} or more, got {count}")
     devices = chosen_devices(options.devices)
     check_out(options.out, "judge")
+    blocks = options.out / BLOCKS
+    if (blocks / MANIFEST).exists() and store.resume(blocks).settings != JUDGED:
+        raise ValueError(f"--out: {options.out} holds a campaign: choose another folder")
     if options.estimator is not None and len(folders) > 1:
         raise ValueError(f"--estimator: expected one folder of estimates, got {len(folders)}")
     return JudgePlan(draws, folders, world, filters, runs, devices, formats)
 
 
-def judge_folders(plan: JudgePlan, options: argparse.Namespace, user: UserObjects) -> Campaign:
-    """Compute the estimates if the user has a program for that, and judge those of all folders."""
+def judge_folders(
+    plan: JudgePlan, options: argparse.Namespace, user: UserObjects
+) -> tuple[Campaign, dict[str, np.ndarray]]:
+    """The campaign of the estimates in all folders, and its numbers by run for a store.
+
+    The estimates are computed first if the user has a program for that.
+    """
     draws = plan.draws
+    columns: dict[str, np.ndarray] = {}
     failures: dict[int, RunFault] = {}
     if options.estimator is not None:
         (folder,) = plan.folders.values()
@@ -248,5 +267,6 @@ def judge_folders(plan: JudgePlan, options: argparse.Namespace, user: UserObject
             stride=options.stride,
             bound=options.bound,
             devices=plan.devices,
+            save=columns.update,
         )
-    return replace(campaign, reference=options.compare or "")
+    return replace(campaign, reference=options.compare or ""), columns

@@ -124,8 +124,8 @@ def test_statistics_are_those_of_their_names():
     assert value["NIS trend"] == pytest.approx(np.corrcoef(nis, time[row])[0, 1])
     moments = stats.kurtosis(unit[:, 0], fisher=False)  # about the mean, which is small
     assert value["kurtosis, range"] == pytest.approx(moments, rel=0.02)
-    beyond = (2 * nis / nis.mean() > stats.chi2.ppf(0.99, 2)).mean()
-    assert value["tail, above the 99 % quantile"] == beyond
+    beyond = (2 * nis / nis.mean() > stats.chi2.ppf(0.99, 2)).sum()
+    assert beyond - 1 < len(nis) * value["tail, above the 99 % quantile"] <= beyond
     assert value["rejected by the gate"] == pytest.approx(1 / valid.sum())
     products, squares = 0.0, np.zeros(2)
     for slot in (0, 1):
@@ -133,6 +133,17 @@ def test_statistics_are_those_of_their_names():
         products += (of[3:] * of[:-3]).sum()
         squares += (of[3:] ** 2).sum(), (of[:-3] ** 2).sum()
     assert value["autocorrelation, lag 3"] == pytest.approx(products / np.sqrt(squares.prod()))
+
+
+def test_the_count_of_a_tail_falls_by_one_at_each_value():
+    values, limits = np.array([1.0, 2.0, 2.0, 5.0]), np.array([1.5, 2.0, 3.5, 5.0, 10.0])
+    counts = [log_statistics.tail_count(values, limit) for limit in limits]
+    np.testing.assert_allclose(counts, [2.5, 1.0, 0.5, 0.0, -0.5])
+    assert (
+        log_statistics.tail_count(values[:0], 1.0) == log_statistics.tail_count(values, 1e30) == -1
+    )
+    fine = [log_statistics.tail_count(values, limit) for limit in np.linspace(0.1, 9, 500)]
+    assert (np.diff(fine) <= 0).all()
 
 
 def test_the_amount_of_a_fault_is_that_of_weighted_least_squares():
