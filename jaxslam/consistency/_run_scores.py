@@ -163,6 +163,15 @@ class _Pairs(NamedTuple):
             number=before.valid * now.valid[None],
         )
 
+    def autocorrelation(self, size: int) -> Float[Array, "LAGS 3"]:
+        """Σ wᵀw', √(Σ|w|² Σ|w'|²), over which that is the correlation, and the pairs of numbers, by
+        lag. size: of w."""
+        product, earlier, later, number = (values.sum(axis=1) for values in self)
+        squares = earlier * later
+        is_pair = squares > 0
+        length = jnp.where(is_pair, jnp.sqrt(jnp.where(is_pair, squares, 1.0)), 0.0)
+        return jnp.stack([product, length, number * size], axis=1)
+
 
 class _Sums(NamedTuple):
     poison: Array
@@ -228,12 +237,6 @@ def run_statistics(
     )
     sums, (nees, regular) = jax.lax.scan(step, nothing, (estimate, info, held))
 
-    # √(Σ|w|² Σ|w'|²) by lag, over which Σ wᵀw' is the correlation; 0 without a pair.
-    product, earlier, later, pairs = (pair.sum(axis=1) for pair in sums.pairs)
-    squares = earlier * later
-    is_pair = squares > 0
-    length = jnp.where(is_pair, jnp.sqrt(jnp.where(is_pair, squares, 1.0)), 0.0)
-
     # The map at the end; a known one has no errors.
     is_judged = (held[-1] >= 0) & (estimate.point_covs[-1] != 0).any()
     error = points[jnp.maximum(held[-1], 0)] - estimate.points[-1]
@@ -243,7 +246,7 @@ def run_statistics(
         landmark_nees=nees,
         regular_landmarks=regular,
         landmark_squares=jnp.stack([square, is_judged.sum().astype(dtype)]),
-        autocorrelation=jnp.stack([product, length, pairs * size], axis=1),
+        autocorrelation=sums.pairs.autocorrelation(size),
         values=values,
     )
 

@@ -58,6 +58,15 @@ class Columns(NamedTuple, Generic[_Name]):
         return np.column_stack([self.columns[name] for name in names])
 
 
+_OUTSIDE = "measurements outside the odometry"
+_IN_GAP = "measurements in a gap of the odometry"
+_NEGATIVE = "measurements with a range below 0"
+_BEYOND = "measurements of the maximum range"
+_SOON = "measurements closer than the spacing"
+_DROPPED = (_OUTSIDE, _IN_GAP, _NEGATIVE, _BEYOND, _SOON)
+"""Why measurements are not in the rows; the first is stated with a count of 0, too."""
+
+
 class Seen(NamedTuple, Generic[_Name]):
     """The measurements of one sensor."""
 
@@ -101,36 +110,29 @@ class Seen(NamedTuple, Generic[_Name]):
                 )
         return np.array(tags, np.int64)
 
-    def too_soon(
-        self, tag: Int[np.ndarray, "J"], used: Bool[np.ndarray, "J"]
-    ) -> Bool[np.ndarray, "J"]:
-        """Mask of the used measurements sooner after one of the same landmark than the spacing.
+    def unused(
+        self, tag: Int[np.ndarray, "J"], inside: Bool[np.ndarray, "J"]
+    ) -> dict[str, Bool[np.ndarray, "J"]]:
+        """Masks of the measurements, among those inside, that say nothing or too much, by reason.
 
-        Raises ValueError, with the place, on a used measurement without a tag.
+        Raises ValueError, with the place, on one of an unknown landmark where there is a spacing.
         """
+        values, when = self.table.values(self.measured), self.table.columns[TIME]
+        ranges = [k for k, name in enumerate(self.measured) if split_unit(name)[0] == "range"]
+        negative = inside & (values[:, ranges] < 0).any(axis=1)
+        beyond = inside & (values[:, ranges] >= self.max_range).any(axis=1)
+        rest = inside & ~negative & ~beyond
         too_soon = np.zeros(len(tag), bool)
-        if not self.spacing:
-            return too_soon
-        if unknown := np.flatnonzero(used & (tag < 0)).tolist():
+        if self.spacing and (unknown := np.flatnonzero(rest & (tag < 0)).tolist()):
             reason = "expected a tag, since a spacing is of one landmark, got none"
             raise InvalidField(self.table.at(unknown[0], TAG), reason)
-        when = self.table.columns[TIME]
         last: dict[int, float] = {}
-        for row in np.flatnonzero(used):
+        for row in np.flatnonzero(rest) if self.spacing else ():
             # A spacing of whole intervals is not to be missed by rounding of the stamps.
             too_soon[row] = when[row] - last.get(tag[row], -math.inf) < self.spacing * (1 - 1e-6)
             if not too_soon[row]:
                 last[tag[row]] = when[row]
-        return too_soon
-
-
-_OUTSIDE = "measurements outside the odometry"
-_IN_GAP = "measurements in a gap of the odometry"
-_NEGATIVE = "measurements with a range below 0"
-_BEYOND = "measurements of the maximum range"
-_SOON = "measurements closer than the spacing"
-_DROPPED = (_OUTSIDE, _IN_GAP, _NEGATIVE, _BEYOND, _SOON)
-"""Why measurements are not in the rows; the first is stated with a count of 0, too."""
+        return {_NEGATIVE: negative, _BEYOND: beyond, _SOON: too_soon}
 
 
 class Aligned(NamedTuple, Generic[_Name]):
@@ -237,16 +239,11 @@ def align_tables(
                 f"expected a time of the odometry, since {', '.join(columns)} cannot be divided, "
                 f"got {when[lost[0]]:.12g}; poses can: {TIME}, {', '.join(POSE)}",
             )
-        values = seen.table.values(seen.measured)
-        ranges = [k for k, name in enumerate(seen.measured) if split_unit(name)[0] == "range"]
-        negative = is_inside & (values[:, ranges] < 0).any(axis=1)
-        beyond = is_inside & (values[:, ranges] >= seen.max_range).any(axis=1)
-        used = is_inside & ~negative & ~beyond
-        soon = seen.too_soon(tag, used)
-        used &= ~soon
-        for reason, mask in ((_NEGATIVE, negative), (_BEYOND, beyond), (_SOON, soon)):
+        unused = seen.unused(tag, is_inside)
+        for reason, mask in unused.items():
             dropped[reason] += int(mask.sum())
-        used_streams.append((when[used], tag[used], values[used]))
+        used = is_inside & ~np.logical_or.reduce(list(unused.values()))
+        used_streams.append((when[used], tag[used], seen.table.values(seen.measured)[used]))
 
     # A row at every time, with the slots of the sensors side by side.
     times = np.unique(np.concatenate([clock, *(when for when, *_ in used_streams)]))
