@@ -259,7 +259,7 @@ def _filter_section(world: World) -> dict[str, object]:
     method = _METHODS.get(type(rule))
     further = [
         field.name
-        for field in dataclasses.fields(rule)  # type: ignore[arg-type]
+        for field in dataclasses.fields(rule)
         if field.name not in ("gate", "new_gate", "probability")
         and getattr(rule, field.name) != field.default
     ]

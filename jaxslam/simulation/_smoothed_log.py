@@ -82,6 +82,10 @@ class SmoothedLog(NamedTuple):
     """whether a measurement corrected the map"""
     still: bool
     """whether no motion has a noise"""
+    converged: bool
+    """whether a further step of the search makes no difference"""
+    steps: int
+    """of the search"""
 
 
 def associates(options: dict[str, Any]) -> bool:
@@ -102,24 +106,22 @@ def smooth(data: RecordedLog) -> SmoothedLog:
     by_odometry = is_single and sensor.of_points and sensor.free.mean.shape[0] > 0
     with float64():  # in single precision a long log does not converge
         if by_odometry and not associates(data.filter_options):
-            smoothed, ending, step, count = _from_odometry(data)
+            smoothed = _from_odometry(data)
         else:
-            smoothed, ending, step, count = _from_filter(data)
-    is_near = ending == Ending.CONVERGED or step < _NEAR
-    if not (
-        is_near and np.isfinite(smoothed.noise).all() and np.isfinite(smoothed.landmarks).all()
-    ):
+            smoothed = _from_filter(data)
+    is_finite = np.isfinite(smoothed.noise).all() and np.isfinite(smoothed.landmarks).all()
+    if not (smoothed.converged and is_finite):
         raise InvalidField(
             "dataset",
-            f"the smoothing of {data.name} did not converge in {count} steps: look at the path of "
-            "jaxslam run, fit the noises (jaxslam fit FOLDER --write), or set a gate against wrong "
-            "measurements",
+            f"the smoothing of {data.name} did not converge in {smoothed.steps} steps: look at the "
+            "path of jaxslam run, fit the noises (jaxslam fit FOLDER --write), or set a gate "
+            "against wrong measurements",
         )
     return smoothed
 
 
-def _from_filter(data: RecordedLog) -> tuple[SmoothedLog, int, float, int]:
-    """The smoothed log from the path of an EKF; ending, next step, and steps of the search."""
+def _from_filter(data: RecordedLog) -> SmoothedLog:
+    """The smoothed log by `BatchMap`, from the path of an EKF."""
     options = data.filter_options
     chosen = {name: options[name] for name in ("associate", "gate", "births") if name in options}
     start = np.asarray(data.pose, np.float64)
@@ -141,6 +143,8 @@ def _from_filter(data: RecordedLog) -> tuple[SmoothedLog, int, float, int]:
     before = np.concatenate([start[None], np.asarray(solved.filtered.pose)[:-1]])
     control = np.asarray(data.log.control, np.float64)
     roots = np.asarray(jax.device_get(_noise_roots(data.motion, before, control)))
+
+    # Landmarks by tag, where the log has tags, else by slot; and of each measurement its landmark.
     used = (status == Status.FUSED) | (status == Status.BORN)
     slots = np.flatnonzero(solved.joint.alive)
     tags = np.asarray(solved.joint.tag)[slots]
@@ -148,23 +152,26 @@ def _from_filter(data: RecordedLog) -> tuple[SmoothedLog, int, float, int]:
         slots, tags = slots[np.argsort(tags)], np.sort(tags)
     row = np.full(len(solved.joint.alive), -1)
     row[slots] = np.arange(len(slots))
-    smoothed = SmoothedLog(
+    return SmoothedLog(
         noise=np.einsum("tij,tj->ti", roots, solved.noise),
         landmarks=np.asarray(solved.joint.landmarks)[slots],
         tag=tags,
         seen=np.where(used, row[np.where(used, slot, 0)], -1),
         fused=bool((status == Status.FUSED).any()),
         still=not roots.any(),
+        converged=bool(solved.ending == Ending.CONVERGED or solved.step < _NEAR),
+        steps=int(solved.iterations),
     )
-    return smoothed, int(solved.ending), float(solved.step), int(solved.iterations)
 
 
-def _from_odometry(data: RecordedLog) -> tuple[SmoothedLog, int, float, int]:
-    """The smoothed log from the path of the odometry, tags known; as `_from_filter`."""
+def _from_odometry(data: RecordedLog) -> SmoothedLog:
+    """The smoothed log by the same search, from the path of the odometry, with known tags."""
     log: Log = jax.tree.map(np.asarray, data.log)
     start = np.asarray(data.pose, np.float64)
     control = np.asarray(log.control, np.float64)
     path = np.asarray(jax.device_get(nominal_path(data.motion, start, control)))
+
+    # Each landmark begins where it agrees best with its measurements from that path.
     valid = np.asarray(log.scan.valid) & (np.asarray(log.scan.tag) >= 0)
     tags = np.unique(np.asarray(log.scan.tag)[valid])
     slot = np.where(valid, np.searchsorted(tags, log.scan.tag), 0)
@@ -175,6 +182,7 @@ def _from_odometry(data: RecordedLog) -> tuple[SmoothedLog, int, float, int]:
             for of in (valid & (slot == k) for k in range(len(tags)))
         ]
     )
+
     before = np.concatenate([start[None], path[:-1]])
     roots = _noise_roots(data.motion, before, control)
     cov = np.asarray(data.pose_cov, np.float64)
@@ -182,15 +190,16 @@ def _from_odometry(data: RecordedLog) -> tuple[SmoothedLog, int, float, int]:
     noise, landmarks, ending, decrement, count = jax.device_get(
         _solve(data.motion, data.sensor, *arguments)
     )
-    smoothed = SmoothedLog(
+    return SmoothedLog(
         noise=np.einsum("tij,tj->ti", np.asarray(roots), noise),
         landmarks=landmarks,
         tag=tags,
         seen=np.where(valid, slot, -1),
         fused=True,
         still=not np.asarray(roots).any(),
+        converged=bool(ending == Ending.CONVERGED or np.sqrt(max(decrement, 0.0)) < _NEAR),
+        steps=int(count),
     )
-    return smoothed, int(ending), float(np.sqrt(max(decrement, 0.0))), int(count)
 
 
 @partial(jax.jit, inline=True)

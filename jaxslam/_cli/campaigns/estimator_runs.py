@@ -146,9 +146,9 @@ class Programs:
                     status = None
                     _kill(process)
             seconds = time.perf_counter() - began
-            with said.open("rb") as file:  # the end of it; a character has at most 4 bytes
-                file.seek(max(said.stat().st_size - 4 * _SHOWN, 0))
-                text = file.read().decode("utf-8", "replace").strip()[-_SHOWN:]
+            with said.open("rb") as end:  # a character has at most 4 bytes
+                end.seek(max(said.stat().st_size - 4 * _SHOWN, 0))
+                text = end.read().decode("utf-8", "replace").strip()[-_SHOWN:]
             if status is None:
                 assert self._limit is not None
                 return RunFault(f"over the time limit of {self._limit:g} s", "", text)
