@@ -196,6 +196,8 @@ def check_models(
         block = -(-twins // (blocks * len(devices)))
         block = max(block, min(-(-_PLANTED // len(devices)), BLOCK))
     runs = _Runs(world, filter, key, devices, block, check_dtype(dtype))
+
+    # The filter over the log, and over logs in which a fault each is planted.
     faults, slips = faults_of(world)
     truth, planted = jax.device_get(planted_logs(world, faults, slips))
     recorded = jax.tree.map(lambda leaf: np.asarray(leaf)[None], log)
@@ -207,18 +209,22 @@ def check_models(
         wide: PyTree = tuple(_widen(leaf, spare) for leaf in logs.scan)
         logs = logs._replace(scan=Scan(*wide))
         truth = truth._replace(origin=_widen(truth.origin[None], spare)[0])
-    count = len(logs.control)
-    total = twins + count
     infos = runs.of_logs(truth, logs)
     fused = fused_of(infos)
     with refusals_of("check_models"):
         if not fused.any():
             raise InvalidField("filter", "expected one with innovations, got none in its Info")
+    count = len(logs.control)
+    total = twins + count
     if progress is not None:
         progress(count, total)
+
+    # What each fault does to the innovations tells how much of it a run has.
     innovations = np.where(fused[..., None], np.asarray(infos.innovation, np.float64), 0.0)
     covs = np.asarray(infos.innovation_cov, np.float64)[1]
     shapes = shapes_of(faults, slips, innovations[1:], np.where(fused[1, ..., None, None], covs, 0))
+
+    # The statistics of the log, and of the twins, a block at a time.
     speed, _, turn = body_rates(world).T
     rates, time = Rates(speed, turn), np.asarray(world.time, np.float64)
 
