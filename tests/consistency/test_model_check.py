@@ -11,10 +11,10 @@ from cases import refused
 from scipy import stats
 
 from jaxslam import catalog, sensors
+from jaxslam.consistency import CheckedStatistic, ModelCheck, check_models
 from jaxslam.consistency import _log_statistics as log_statistics
 from jaxslam.consistency import _model_check as model_check
 from jaxslam.consistency import _planted_faults as planted_faults
-from jaxslam.consistency import check_models
 from jaxslam.core.types import Info, Status
 from jaxslam.results import plot
 from jaxslam.simulation import twin
@@ -133,6 +133,16 @@ def test_statistics_are_those_of_their_names():
         products += (of[3:] * of[:-3]).sum()
         squares += (of[3:] ** 2).sum(), (of[:-3] ** 2).sum()
     assert value["autocorrelation, lag 3"] == pytest.approx(products / np.sqrt(squares.prod()))
+
+
+def test_a_filter_that_is_lost_on_its_own_twins_is_doubted():
+    def check(nis):
+        size = log_statistics.Statistic("NIS / dof", "", nis, np.log(nis))
+        row = CheckedStatistic(size, np.full(20, nis), 10, 1.0, 1.0, 0.0, "")
+        return ModelCheck("yard", "ekf", 20, (row,))
+
+    assert not check(1.1).doubt and "lost" not in str(check(1.1))
+    assert "NIS / dof 320: what fits says little" in str(check(320.0)) and check(0.5).doubt
 
 
 def test_the_count_of_a_tail_falls_by_one_at_each_value():
