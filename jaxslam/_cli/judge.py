@@ -252,9 +252,9 @@ def judge_folders(
                 f"{folder} {problem}: expected {run_name(0)}/trajectory.csv, and so on, for each "
                 f"run of {draws.path}"
             )
-    measured = plan.world.sensor.measurements
+    measured, state = plan.world.sensor.measurements, plan.world.motion.state
     sources = {
-        name: folder_source(folder, draws, measured, options.stride, failures)
+        name: folder_source(folder, draws, measured, options.stride, failures, state)
         for name, folder in plan.folders.items()
     }
     with user.located_errors():

@@ -27,7 +27,7 @@ from jaxslam.consistency.campaign._run_estimates import (
     RunFault,
     as_estimate,
 )
-from jaxslam.core.logs._tables import POSE, TAG, TIME, split_unit
+from jaxslam.core.logs._tables import POSE, TAG, TIME, label, split_unit
 from jaxslam.core.types import Log, Truth
 from jaxslam.core.validation import InvalidFile, refusals_of
 from jaxslam.datasets._landmark_logs.table_reader import MEASUREMENTS, ODOMETRY, CsvTable
@@ -116,20 +116,21 @@ class TruthOfRun(NamedTuple):
     """The truth of a run, from its files."""
 
     time: Float[np.ndarray, "T"]
-    pose: Float[np.ndarray, "T 3"]
+    robot: Float[np.ndarray, "T R"]
+    """its pose, and what it has beside it"""
     tags: dict[int | str, int]
     """the row of each landmark, by its name"""
     odometry_time: Float[np.ndarray, "K"]
     """times of the lines of odometry, which need not be steps"""
 
 
-def read_truth(draws: Path, name: str, steps: int) -> TruthOfRun:
-    """The truth of the run with that name, of T steps.
+def read_truth(draws: Path, name: str, steps: int, state: Sequence[str] = POSE) -> TruthOfRun:
+    """The truth of the run with that name, of T steps. state: `Motion.state`.
 
     Raises ValueError, with file and line, where it cannot be read.
     """
     path = CsvTable(draws / TRUTH / name / "truth.csv")
-    columns = path.table((TIME, *POSE), "of the truth")
+    columns = path.table((TIME, *state), "of the truth")
     if len(path.lines) != steps:
         reason = f"expected {steps} lines, as many as the run has steps, got {len(path.lines)}"
         raise InvalidFile(path.path, reason)
@@ -139,7 +140,7 @@ def read_truth(draws: Path, name: str, steps: int) -> TruthOfRun:
         names = CsvTable(survey).table((TAG,), "of landmarks").tags or ()
         tags = {tag: row for row, tag in enumerate(names) if tag is not None}
     odometry = CsvTable(draws / RUNS / name / ODOMETRY).table((TIME,), "of odometry")
-    return TruthOfRun(columns.columns[TIME], columns.values(POSE), tags, odometry.columns[TIME])
+    return TruthOfRun(columns.columns[TIME], columns.values(state), tags, odometry.columns[TIME])
 
 
 def folder_source(
@@ -148,25 +149,29 @@ def folder_source(
     measurements: Sequence[str],
     stride: int,
     failures: Mapping[int, RunFault],
+    state: Sequence[str] = POSE,
 ) -> Source:
     """The estimates in a folder, read run by run, as `judge_sources` takes them.
 
     Args:
         measurements: names of the numbers of a measurement, which are columns of a log.
         failures: of runs without an estimate, why there is none.
+        state: names of the numbers of the robot, the pose first.
     """
 
     def outcome_of(number: int, truth: Truth, log: Log) -> Outcome:
         name = run_name(number)
-        in_file = read_truth(draws.path, name, len(truth.pose))
-        gap = np.abs(in_file.pose - np.asarray(truth.pose, np.float64))
+        in_file = read_truth(draws.path, name, len(truth.pose), state)
+        gap = np.abs(in_file.robot - np.asarray(truth.robot, np.float64))
         gap[:, 2] = np.minimum(gap[:, 2], np.abs(2 * math.pi - gap[:, 2]))
         if not (largest := float(gap.max())) <= _SAME:
             path = draws.path / TRUTH / name / "truth.csv"
-            raise _draws_error(path, draws, f"poses that differ by {largest:.3g}")
+            raise _draws_error(path, draws, f"numbers that differ by {largest:.3g}")
         if number == 0:  # the other runs have the same key
             _check_log(draws, name, measurements, log)
-        truth = truth._replace(pose=in_file.pose)
+        truth = truth._replace(pose=in_file.robot[:, :3])
+        if truth.further is not None:
+            truth = truth._replace(further=in_file.robot[:, 3:])
         if number in failures:
             return Outcome(truth, None, failures[number])
         folder = estimates / name
@@ -175,7 +180,7 @@ def folder_source(
             reason = f"expected an estimate of {draws.path}, got one of other draws"
             raise InvalidFile(folder / PROGRAM, reason)
         size = int(np.shape(log.scan.z)[2])
-        result = read_estimate(folder, in_file, stride, size)
+        result = read_estimate(folder, in_file, stride, size, state[3:])
         if isinstance(result, RunFault):
             return Outcome(truth, None, result)
         return Outcome(truth, result, None, _seconds(origin))
@@ -224,16 +229,17 @@ def _seconds(origin: Mapping[str, object]) -> float | None:
 
 
 def read_estimate(
-    folder: Path, truth: TruthOfRun, stride: int, size: int
+    folder: Path, truth: TruthOfRun, stride: int, size: int, further: Sequence[str] = ()
 ) -> RunEstimate | RunFault:
     """The estimate in a folder, at steps k, 2k, …, T, or why there is none; k is `stride`.
 
-    size: Z, of a measurement. Raises ValueError, with file and line, on what is not such a file.
+    size: Z, of a measurement. further: names of what the robot has beside its pose. Raises
+    ValueError, with file and line, on what is not such a file.
     """
     if stored_file(folder / TRAJECTORY) is None:
         detail = f"no {TRAJECTORY} in it" if folder.is_dir() else f"no folder {folder.name}"
         return RunFault(MISSING, detail)
-    steps = len(truth.pose)
+    steps = len(truth.robot)
     path = _Table(folder / TRAJECTORY)
     if not path.header:
         return RunFault(EARLY, f"{TRAJECTORY} is empty")
@@ -255,6 +261,7 @@ def read_estimate(
     rows = [row_of[step] for step in judged]
     poses = path.values(_POSE)[rows]
     covs = _symmetric(path.values(_POSE_COV)[rows], 3)
+    beside = _read_further(path, rows, further)
     maps = innovations = None
     if stored_file(folder / MAP) is not None:
         maps = _read_map(_Table(folder / MAP), truth)
@@ -263,7 +270,21 @@ def read_estimate(
         if isinstance(innovations, RunFault):
             return innovations
     with refusals_of(str(folder)):
-        return as_estimate(RunEstimate(poses, covs, maps, innovations))
+        return as_estimate(RunEstimate(poses, covs, maps, innovations, *beside))
+
+
+def _read_further(
+    path: "_Table", rows: Sequence[int], further: Sequence[str]
+) -> tuple[np.ndarray, np.ndarray] | tuple[None, None]:
+    """What the robot has beside its pose, and the covariances; None where the file has no column
+    of these names."""
+    names = list(map(label, further))
+    path.units |= {name: split_unit(column)[1] for name, column in zip(names, further, strict=True)}
+    if not set(names) & set(path.names):
+        return None, None
+    pairs = [(names[i], names[j]) for i, j in zip(*np.triu_indices(len(names)), strict=True)]
+    triangle = path.values([f"c_{a}_{b}" for a, b in pairs])[rows]
+    return path.values(names)[rows], _symmetric(triangle, len(names))
 
 
 def _read_map(path: "_Table", truth: TruthOfRun) -> tuple[np.ndarray, ...]:
@@ -333,7 +354,8 @@ class _Table:
         else:
             table = CsvTable(path)
             self.header, self.lines, self.cells = table.header, table.lines, table.cells
-        self.names = [split_unit(name)[0] for name in self.header]
+        self.names = list(map(label, self.header))
+        self.units: dict[str, str | None] = dict(_UNITS)
 
     def error(self, row: int, reason: str, place: int | None = None) -> InvalidFile:
         """The error about a row, and a column."""
@@ -346,8 +368,8 @@ class _Table:
             if name in self.names:
                 place = self.names.index(name)
                 unit = split_unit(self.header[place])[1]
-                if unit not in (None, _UNITS.get(name)):
-                    reason = f"expected the unit [{_UNITS.get(name, '')}]"
+                if unit not in (None, self.units.get(name)):
+                    reason = f"expected the unit [{self.units.get(name, '')}]"
                     raise InvalidFile(self.path, reason, 1, self.header[place])
                 return place
         expected, got = " or ".join(map(repr, names)), ", ".join(map(repr, self.header))

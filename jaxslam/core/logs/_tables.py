@@ -55,6 +55,8 @@ class Columns(NamedTuple, Generic[_Name]):
 
     def values(self, names: Sequence[str]) -> np.ndarray:
         """Some columns side by side, (K, len(names))."""
+        if not names:  # of a robot without odometry
+            return np.zeros((len(self.columns[TIME]), 0))
         return np.column_stack([self.columns[name] for name in names])
 
 
@@ -148,6 +150,11 @@ def split_unit(name: str) -> tuple[str, str | None]:
     """Name and unit of a column, ("v", "m/s") of "v [m/s]"; None without a unit."""
     bare, bracket, unit = name.strip().partition("[")
     return bare.strip(), unit.rstrip("] ").strip() if bracket else None
+
+
+def label(name: str) -> str:
+    """The name of a column without its unit, as one word: scale_1 of "scale 1 [1]"."""
+    return split_unit(name)[0].replace(" ", "_")
 
 
 def unit_divisor(unit: str | None, wanted: str) -> float | None:

@@ -330,15 +330,18 @@ class TableSettings:
         bare = self._build("motion", factory, options, of_no_noise)
         from_poses = odometry_columns(bare.controls, header) == POSE
         with_interval = INTERVAL in bare.controls
-        if len(odometry_columns(bare.controls, header)) == 0:
-            raise ValueError(
-                f"{self._at('motion', 'model')}: expected a model with odometry, got {bare.name}"
-            )
         correctable = odometry_errors.can_correct(bare)
         own_states = len(bare.state) - 3  # whose rates are the last noises
         count = len(bare.noises) - own_states
         of_errors = self._states(bare, errors, correctable)
-        parameters = self._noise("motion", bare.noises[:count], _MOTION_NOISE)
+        parameters: tuple[Parameter, ...] = ()
+        if count:
+            parameters = self._noise("motion", bare.noises[:count], _MOTION_NOISE)
+        elif "noise" in self.content.get("motion", {}):
+            raise ValueError(
+                f"{self._at('motion', 'noise')}: expected none: {bare.name} has no odometry, and "
+                "[state] noise says how its velocities change"
+            )
         adjustable = {key: row for key, row in _ODOMETRY_ERRORS.items() if key not in of_errors}
         parameters += self._errors("motion", adjustable if correctable else {}, errors)
         before_walks = len(parameters)
