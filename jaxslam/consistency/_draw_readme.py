@@ -38,6 +38,15 @@ theta_s = wrap(theta + mount_theta)"""
 
 _NO_MOUNT = "x_s, y_s, theta_s = x, y, theta    # the sensor is at the robot's pose"
 
+_JUDGING = """The judge is a command of the Python package `jaxslam`. It compares the errors \
+with the covariances (NEES, intervals, a verdict), beside filters of the package on the same runs, \
+and can run your program itself:
+
+```console
+$ jaxslam judge estimates --draws draws --filters ekf --out out
+$ jaxslam judge estimates --draws draws --out out --estimator './my_filter {run} {estimate}'
+```"""
+
 
 def readme_text(world: World, runs: int, odometry: Odometry) -> str:
     """The text of README.md. odometry: of the nominal controls, for columns and times."""
@@ -49,7 +58,7 @@ def readme_text(world: World, runs: int, odometry: Odometry) -> str:
         "Motion": _motion(world),
         "Measurements": _measurements(world),
         "What to write": _estimates(world),
-        "How it is judged": _judging(),
+        "How it is judged": _JUDGING,
         "dataset.toml": _settings(world),
     }
     (title, first), *rest = sections.items()
@@ -263,17 +272,6 @@ def _estimates(world: World) -> str:
     ).rstrip()
 
 
-def _judging() -> str:
-    return (
-        "The judge is a command of the Python package `jaxslam`. It compares the errors with the "
-        "covariances (NEES, intervals, a verdict), beside filters of the package on the same runs, "
-        "and can run your program itself:\n\n```console\n"
-        "$ jaxslam judge estimates --draws draws --filters ekf --out out\n"
-        "$ jaxslam judge estimates --draws draws --out out --estimator './my_filter {run} "
-        "{estimate}'\n```"
-    )
-
-
 def _settings(world: World) -> str:
     text = "`jaxslam run --dataset table runs/0000` runs the library's EKF-SLAM on a run."
     if keys := unsaid_settings(world):
@@ -329,15 +327,13 @@ def _constants(model: object) -> Iterator[tuple[str, ArrayLike]]:
         value = getattr(model, field.name)
         if isinstance(value, Model):
             yield from (row for row in _constants(value) if row[0] not in varying)
-        elif field.name not in ("noise_cov", "noise", "mount", "free") and _is_number(value):
-            yield field.name, value
-
-
-def _is_number(value: object) -> bool:
-    try:
-        return np.asarray(value).dtype.kind in "iuf"
-    except ValueError:  # of several shapes, as a mean and its covariance
-        return False
+        elif field.name not in ("noise_cov", "noise", "mount", "free"):
+            try:
+                kind = np.asarray(value).dtype.kind
+            except ValueError:  # of several shapes, as a mean and its covariance
+                continue
+            if kind in "iuf":
+                yield field.name, value
 
 
 def _noise(model: Motion | Sensor, names: tuple[str, ...], symbol: str) -> str:

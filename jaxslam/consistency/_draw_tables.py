@@ -146,6 +146,12 @@ def run_files(world: World, log: Log) -> Files:
         tag = np.where(has_unknown_tags(world), -1, np.asarray(scan.tag)[row, slot])
         columns.append(["" if number < 0 else str(number) for number in tag.tolist()])
     columns += map(_numbers, np.asarray(scan.z, np.float64)[row, slot].T)
+    sections = {
+        name: "".join(
+            f"{key} = {_toml(value)}\n" for key, value in section.items() if value is not None
+        )
+        for name, section in settings_of(world, odometry).items()
+    }
     return {
         "odometry.csv": _csv(
             (TIME, *odometry.names), [_numbers(odometry.time), *map(_numbers, odometry.values.T)]
@@ -153,7 +159,7 @@ def run_files(world: World, log: Log) -> Files:
         "measurements.csv": _csv(
             measurement_columns(sensor.measurements, sensor.landmark), columns
         ),
-        "dataset.toml": _toml_text(settings_of(world, odometry)),
+        "dataset.toml": "\n".join(f"[{name}]\n{text}" for name, text in sections.items()),
     }
 
 
@@ -301,20 +307,17 @@ def _filter_section(world: World) -> dict[str, object]:
         return section | {"associate": "known", "gate": gate}
     probability = getattr(rule, "probability", getattr(rule, "gate", None))
     method = _METHODS.get(type(rule))
+    further = [
+        field.name
+        for field in dataclasses.fields(rule)
+        if field.name not in ("gate", "new_gate", "probability")
+        and getattr(rule, field.name) != field.default
+    ]
     # A rule with further options is no method of the reader's, nor is one with a gate behind it.
-    if method is None or probability is None or gate is not None or _is_unusual(rule):
+    if method is None or probability is None or gate is not None or further:
         return section | {"associate": f"{rule!r}: {_UNSAID}"}
     new_gate = probability if rule.new_gate is None else rule.new_gate
     return section | {"associate": method, "gate": probability, "new_gate": new_gate}
-
-
-def _is_unusual(rule: object) -> bool:
-    """Whether a rule has other options than its gates, whose value is not the default."""
-    return any(
-        getattr(rule, field.name) != field.default
-        for field in dataclasses.fields(rule)  # type: ignore[arg-type]
-        if field.name not in ("gate", "new_gate", "probability")
-    )
 
 
 def _registered(model: Motion | Sensor, registry: Mapping[str, object]) -> str | None:
@@ -346,16 +349,6 @@ def _numbers(values: Float[np.ndarray, "K"]) -> list[str]:
 def _csv(header: Sequence[str], columns: Sequence[Sequence[str]]) -> str:
     lines = [",".join(header), *map(",".join, zip(*columns, strict=True))]
     return "\n".join(lines) + "\n"
-
-
-def _toml_text(sections: Mapping[str, Mapping[str, object]]) -> str:
-    return "\n".join(
-        f"[{name}]\n"
-        + "".join(
-            f"{key} = {_toml(value)}\n" for key, value in section.items() if value is not None
-        )
-        for name, section in sections.items()
-    )
 
 
 def _toml(value: object) -> str:

@@ -116,27 +116,32 @@ def recorded_world(
     with refusals_of("recorded_world"):
         require("motion", motion, instance_of(Motion))
         require("sensor", sensor, instance_of(Sensor))
+
+        # The logs, of one shape.
         if isinstance(logs, Log) or not isinstance(logs, Sequence) or not logs:
             empty = "an empty " * (isinstance(logs, Sequence) and not logs)
             got = f"{empty}{type(logs).__name__}"
             raise InvalidField("logs", f"expected a list of Log, one a run, got {got}")
         slots = sensor.places if isinstance(sensor, Suite) else ()
+        is_log = log_of(len(motion.controls), len(sensor.measurements), slots)
+        shapes = []
         for i, log in enumerate(logs):
-            sizes = len(motion.controls), len(sensor.measurements)
-            require(f"logs[{i}]", log, log_of(*sizes, slots))
-            if np.shape(log.scan.tag) != np.shape(logs[0].scan.tag):
+            require(f"logs[{i}]", log, is_log)
+            shapes.append(np.shape(log.scan.tag))
+            if shapes[i] != shapes[0]:
                 raise InvalidField(
                     "logs",
                     "expected the same numbers of rows and measurement slots, got "
-                    f"{np.shape(logs[0].scan.tag)} in run 0 and {np.shape(log.scan.tag)} in "
-                    f"run {i}",
+                    f"{shapes[0]} in run 0 and {shapes[i]} in run {i}",
                 )
-        table = np.asarray(landmarks, np.float64)
-        if table.ndim == 2:
-            table = np.broadcast_to(table, (len(logs), *table.shape))
         log = jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *logs)
         runs, steps, places = log.scan.tag.shape
         size = len(motion.state)
+
+        # The truth of each run: a map of all runs and a start of all are repeated.
+        table = np.asarray(landmarks, np.float64)
+        if table.ndim == 2:
+            table = np.broadcast_to(table, (runs, *table.shape))
         if starts is None:
             start = np.asarray(require("pose", pose, finite(size)), np.float64)
             starts = np.broadcast_to(start, (runs, size))
@@ -156,16 +161,16 @@ def recorded_world(
             require("origin", truth.origin, array_of(runs, steps, places, kind=np.integer))
         numbers = {"poses": robots, "landmarks": table, "starts": truth.start}
         for argument, values in numbers.items():
-            is_finite = np.isfinite(values)
-            if not is_finite.all():
-                run, *place = np.argwhere(~is_finite)[0]
-                row, hint = "", ""
-                if argument == "poses":
-                    row, hint = f", row {place[0]}", ": cut the log to rows with a true pose"
-                raise InvalidField(argument, f"expected finite numbers of run {run}{row}{hint}")
+            for run, row, *_ in np.argwhere(~np.isfinite(values))[:1]:
+                advice = f", row {row}: cut the log to rows with a true pose"
+                raise InvalidField(
+                    argument,
+                    f"expected finite numbers of run {run}{advice * (argument == 'poses')}",
+                )
+
+        # The landmark of each tag is a row of the map.
         tags = np.where(log.scan.valid, log.scan.tag, -1)
-        if tags.max(initial=-1) >= table.shape[1]:
-            run, row, _ = np.argwhere(tags >= table.shape[1])[0]
+        for run, row, _ in np.argwhere(tags >= table.shape[1])[:1]:
             raise InvalidField(
                 "logs",
                 f"expected tags below {table.shape[1]}, the number of landmarks, got {tags.max()} "

@@ -15,6 +15,7 @@ from jaxslam.core.validation import InvalidField
 from jaxslam.graphs._chain.problem import Iterate, Problem, linearize_at, optimize_chain
 from jaxslam.graphs._solver.search import Ending
 from jaxslam.graphs.smoothing._batch_map import BatchMap
+from jaxslam.linearize._first_order import nominal_path
 from jaxslam.math import _linalg as linalg
 from jaxslam.math._arrays import float64
 from jaxslam.sensors._suite import Suite, of_robot
@@ -83,6 +84,10 @@ class SmoothedLog(NamedTuple):
     """whether no motion has a noise"""
     further: Float[np.ndarray, "T E"]
     """the most likely numbers of the robot beside its pose, before each motion"""
+    converged: bool
+    """whether a further step of the search makes no difference"""
+    steps: int
+    """of the search"""
 
 
 def associates(options: dict[str, Any]) -> bool:
@@ -103,24 +108,22 @@ def smooth(data: RecordedLog) -> SmoothedLog:
     by_odometry = is_single and sensor.of_points and sensor.free.mean.shape[0] > 0
     with float64():  # in single precision a long log does not converge
         if by_odometry and not associates(data.filter_options):
-            smoothed, ending, step, count = _from_odometry(data)
+            smoothed = _from_odometry(data)
         else:
-            smoothed, ending, step, count = _from_filter(data)
-    is_near = ending == Ending.CONVERGED or step < _NEAR
-    if not (
-        is_near and np.isfinite(smoothed.noise).all() and np.isfinite(smoothed.landmarks).all()
-    ):
+            smoothed = _from_filter(data)
+    is_finite = np.isfinite(smoothed.noise).all() and np.isfinite(smoothed.landmarks).all()
+    if not (smoothed.converged and is_finite):
         raise InvalidField(
             "dataset",
-            f"the smoothing of {data.name} did not converge in {count} steps: look at the path of "
-            "jaxslam run, fit the noises (jaxslam fit FOLDER --write), or set a gate against wrong "
-            "measurements",
+            f"the smoothing of {data.name} did not converge in {smoothed.steps} steps: look at the "
+            "path of jaxslam run, fit the noises (jaxslam fit FOLDER --write), or set a gate "
+            "against wrong measurements",
         )
     return smoothed
 
 
-def _from_filter(data: RecordedLog) -> tuple[SmoothedLog, int, float, int]:
-    """The smoothed log from the path of an EKF; ending, next step, and steps of the search."""
+def _from_filter(data: RecordedLog) -> SmoothedLog:
+    """The smoothed log by `BatchMap`, from the path of an EKF."""
     options = data.filter_options
     chosen = {name: options[name] for name in ("associate", "gate", "births") if name in options}
     start = np.asarray(data.pose, np.float64)
@@ -142,6 +145,8 @@ def _from_filter(data: RecordedLog) -> tuple[SmoothedLog, int, float, int]:
     before = np.concatenate([start[None], _robots(solved.filtered)[:-1]])
     control = np.asarray(data.log.control, np.float64)
     roots = np.asarray(jax.device_get(_noise_roots(data.motion, before, control)))
+
+    # Landmarks by tag, where the log has tags, else by slot; and of each measurement its landmark.
     used = (status == Status.FUSED) | (status == Status.BORN)
     slots = np.flatnonzero(solved.joint.alive)
     tags = np.asarray(solved.joint.tag)[slots]
@@ -150,7 +155,7 @@ def _from_filter(data: RecordedLog) -> tuple[SmoothedLog, int, float, int]:
     row = np.full(len(solved.joint.alive), -1)
     row[slots] = np.arange(len(slots))
     robots = np.concatenate([solved.start[None], _robots(jax.device_get(trace.estimate))])
-    smoothed = SmoothedLog(
+    return SmoothedLog(
         noise=np.einsum("tij,tj->ti", roots, solved.noise),
         landmarks=np.asarray(solved.joint.landmarks)[slots],
         tag=tags,
@@ -158,8 +163,9 @@ def _from_filter(data: RecordedLog) -> tuple[SmoothedLog, int, float, int]:
         fused=bool((status == Status.FUSED).any()),
         still=not roots.any(),
         further=robots[:-1, 3:],
+        converged=bool(solved.ending == Ending.CONVERGED or solved.step < _NEAR),
+        steps=int(solved.iterations),
     )
-    return smoothed, int(solved.ending), float(solved.step), int(solved.iterations)
 
 
 def _robots(estimate: Estimate) -> Float[np.ndarray, "T R"]:
@@ -168,12 +174,14 @@ def _robots(estimate: Estimate) -> Float[np.ndarray, "T R"]:
     return np.concatenate(list(map(np.asarray, parts)), axis=1)
 
 
-def _from_odometry(data: RecordedLog) -> tuple[SmoothedLog, int, float, int]:
-    """The smoothed log from the path of the odometry, tags known; as `_from_filter`."""
+def _from_odometry(data: RecordedLog) -> SmoothedLog:
+    """The smoothed log by the same search, from the path of the odometry, with known tags."""
     log: Log = jax.tree.map(np.asarray, data.log)
     start = np.asarray(data.pose, np.float64)
     control = np.asarray(log.control, np.float64)
-    path = np.asarray(jax.device_get(_nominal_path(data.motion, start, control)))
+    path = np.asarray(jax.device_get(nominal_path(data.motion, start, control)))
+
+    # Each landmark begins where it agrees best with its measurements from that path.
     valid = np.asarray(log.scan.valid) & (np.asarray(log.scan.tag) >= 0)
     tags = np.unique(np.asarray(log.scan.tag)[valid])
     slot = np.where(valid, np.searchsorted(tags, log.scan.tag), 0)
@@ -185,6 +193,7 @@ def _from_odometry(data: RecordedLog) -> tuple[SmoothedLog, int, float, int]:
             for of in (valid & (slot == k) for k in range(len(tags)))
         ]
     )
+
     before = np.concatenate([start[None], path[:-1]])
     roots = _noise_roots(data.motion, before, control)
     cov = np.asarray(data.pose_cov, np.float64)
@@ -192,7 +201,7 @@ def _from_odometry(data: RecordedLog) -> tuple[SmoothedLog, int, float, int]:
     noise, landmarks, solved, ending, decrement, count = jax.device_get(
         _solve(data.motion, sensor, *arguments)
     )
-    smoothed = SmoothedLog(
+    return SmoothedLog(
         noise=np.einsum("tij,tj->ti", np.asarray(roots), noise),
         landmarks=landmarks,
         tag=tags,
@@ -200,8 +209,9 @@ def _from_odometry(data: RecordedLog) -> tuple[SmoothedLog, int, float, int]:
         fused=True,
         still=not np.asarray(roots).any(),
         further=np.asarray(solved)[:-1, 3:],
+        converged=bool(ending == Ending.CONVERGED or np.sqrt(max(decrement, 0.0)) < _NEAR),
+        steps=int(count),
     )
-    return smoothed, int(ending), float(np.sqrt(max(decrement, 0.0))), int(count)
 
 
 @partial(jax.jit, inline=True)
@@ -210,20 +220,6 @@ def _noise_roots(
 ) -> Float[Array, "T W W"]:
     """The square root of Q of each row."""
     return jax.vmap(linalg.root_psd)(jax.vmap(motion.noise_cov)(before, control))
-
-
-@partial(jax.jit, inline=True)
-def _nominal_path(
-    motion: Motion, start: Float[Array, "R"], control: Float[Array, "T U"]
-) -> Float[Array, "T R"]:
-    still = jnp.zeros(len(motion.noises), control.dtype)
-
-    def step(pose: Array, u: Array) -> tuple[Array, Array]:
-        pose = motion.step(pose, u, still)
-        return pose, pose
-
-    path: Array = jax.lax.scan(step, start, control)[1]
-    return path
 
 
 def _likeliest_place(

@@ -186,7 +186,8 @@ def undoing_control(
     damping = float(jnp.finfo(u.dtype).eps) ** 0.75
 
     def gap(u: Array) -> Array:
-        return _difference(target[:3], motion.step(robot, u, w)[:3])
+        difference = target[:3] - motion.step(robot, u, w)[:3]
+        return difference.at[2].set(wrap(difference[2]))
 
     moved = u
     for _ in range(_NEWTON):
@@ -200,12 +201,6 @@ def undoing_control(
         step, _ = linalg.solve_psd(system, jacobian.T @ gap(moved))
         moved = moved + jnp.where(moves, step, 0.0) * changes
     return moved
-
-
-def _difference(a: Float[Array, "3"], b: Float[Array, "3"]) -> Float[Array, "3"]:
-    """a - b with the heading wrapped."""
-    difference = a - b
-    return difference.at[2].set(wrap(difference[2]))
 
 
 def twin(dataset: RecordedLog, *, spurious: Spurious | None = None) -> Twin:

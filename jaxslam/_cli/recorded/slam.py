@@ -66,7 +66,18 @@ def run_slam(log: LaserLog, options: argparse.Namespace) -> laser_log.Job:
     # Before the work, so that a wrong file is refused at once.
     relations_of_log = None if options.relations is None else read_relations(options.relations, log)
     settings = Settings(resolution=options.resolution)
-    solved = _solve(log, settings)
+    with memory_returned(), Progress(f"{log.name}, reading", "scans") as first:
+        bars = {"": first}
+
+        def report_stage(stage: str, done: int, of: int) -> None:
+            if stage not in bars:
+                unit = "candidates" if stage == "loop closing" else "scans"
+                bars[stage] = Progress(f"{log.name}, {stage}", unit)
+            bars[stage](done, of)
+            if done == of:
+                trim()
+
+        solved = laser_slam.solve(log, settings, progress=report_stage)
     coarser = float(solved.map.resolution) > 1.001 * settings.resolution
     reference = log.corrected if log.placed else None
     files, drawings = result_files(solved), figures(solved, options.figures, reference)
@@ -97,22 +108,6 @@ def run_slam(log: LaserLog, options: argparse.Namespace) -> laser_log.Job:
         **scores,
     }
     return laser_log.Job(summary, files, text, {"relations": entry}, drawings)
-
-
-def _solve(log: LaserLog, settings: Settings) -> Solved:
-    """Solve, with a progress bar for each stage."""
-    with memory_returned(), Progress(f"{log.name}, reading", "scans") as first:
-        bars = {"": first}
-
-        def report_stage(stage: str, done: int, of: int) -> None:
-            if stage not in bars:
-                unit = "candidates" if stage == "loop closing" else "scans"
-                bars[stage] = Progress(f"{log.name}, {stage}", unit)
-            bars[stage](done, of)
-            if done == of:
-                trim()
-
-        return laser_slam.solve(log, settings, progress=report_stage)
 
 
 def result_files(solved: Solved) -> Files:

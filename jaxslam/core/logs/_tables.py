@@ -62,6 +62,15 @@ class Columns(NamedTuple, Generic[_Name]):
         return np.column_stack([self.columns[name] for name in names])
 
 
+_OUTSIDE = "measurements outside the odometry"
+_IN_GAP = "measurements in a gap of the odometry"
+_NEGATIVE = "measurements with a range below 0"
+_BEYOND = "measurements of the maximum range"
+_SOON = "measurements closer than the spacing"
+_DROPPED = (_OUTSIDE, _IN_GAP, _NEGATIVE, _BEYOND, _SOON)
+"""Why measurements are not in the rows; the first is stated with a count of 0, too."""
+
+
 class Seen(NamedTuple, Generic[_Name]):
     """The measurements of one sensor."""
 
@@ -74,6 +83,62 @@ class Seen(NamedTuple, Generic[_Name]):
     """[m] the range from which on it says nothing"""
     spacing: float = 0.0
     """[s] the least time between two measurements of a landmark that are kept"""
+
+    def tags_in_scans(self, tag_of: Mapping[_Name, int]) -> Int[np.ndarray, "J"]:
+        """The tag of each measurement, -1 where unknown.
+
+        Raises ValueError, with the place, on times that fall, a tag twice at a time, and more
+        measurements at a time than slots.
+        """
+        table, when = self.table, self.table.columns[TIME]
+        check_times(table, strict=False)
+        named = table.tags or [None] * len(when)
+        tags = [-1 if name is None else tag_of.get(name, -1) for name in named]
+        scan: set[tuple[float, int]] = set()
+        for row, pair in enumerate(zip(when.tolist(), tags, strict=True)):
+            if pair[1] >= 0 and pair in scan:
+                raise table.error(
+                    row,
+                    TAG,
+                    f"expected a tag once at a time, got {named[row]!r} twice at t = "
+                    f"{pair[0]:.12g}",
+                )
+            scan.add(pair)
+        if self.places is not None:
+            # Times rise, so more than `places` are equal where one is that so many lines before.
+            late = np.flatnonzero(when[self.places :] == when[: -self.places])
+            if late.size:
+                raise table.error(
+                    int(late[0]) + self.places,
+                    TIME,
+                    f"expected at most {self.places} measurement{'s' * (self.places > 1)} at a "
+                    "time, the slots of the sensor, got more",
+                )
+        return np.array(tags, np.int64)
+
+    def unused(
+        self, tag: Int[np.ndarray, "J"], inside: Bool[np.ndarray, "J"]
+    ) -> dict[str, Bool[np.ndarray, "J"]]:
+        """Masks of the measurements, among those inside, that say nothing or too much, by reason.
+
+        Raises ValueError, with the place, on one of an unknown landmark where there is a spacing.
+        """
+        values, when = self.table.values(self.measured), self.table.columns[TIME]
+        ranges = [k for k, name in enumerate(self.measured) if split_unit(name)[0] == "range"]
+        negative = inside & (values[:, ranges] < 0).any(axis=1)
+        beyond = inside & (values[:, ranges] >= self.max_range).any(axis=1)
+        rest = inside & ~negative & ~beyond
+        too_soon = np.zeros(len(tag), bool)
+        if self.spacing and (unknown := np.flatnonzero(rest & (tag < 0)).tolist()):
+            reason = "expected a tag, since a spacing is of one landmark, got none"
+            raise self.table.error(unknown[0], TAG, reason)
+        last: dict[int, float] = {}
+        for row in np.flatnonzero(rest) if self.spacing else ():
+            # A spacing of whole intervals is not to be missed by rounding of the stamps.
+            too_soon[row] = when[row] - last.get(tag[row], -math.inf) < self.spacing * (1 - 1e-6)
+            if not too_soon[row]:
+                last[tag[row]] = when[row]
+        return {_NEGATIVE: negative, _BEYOND: beyond, _SOON: too_soon}
 
 
 class Aligned(NamedTuple, Generic[_Name]):
@@ -142,33 +207,43 @@ def align_tables(
     """
     clock = odometry.columns[TIME]
     check_times(odometry, strict=True)
+
+    # How the odometry becomes controls, and until when it is one.
     columns = odometry_columns(controls, tuple(odometry.columns))
-    last = clock[-1]
+    end = clock[-1]
     rule: streams.Rule = streams.relative_poses if columns == POSE else streams.as_recorded
     if columns != POSE and INTERVAL in controls and controls[:3] != _INCREMENT:
         rule = streams.hold
-        last += np.max(np.diff(clock), initial=0.0)
-    stamps = [seen.table.columns[TIME] for seen in sensors]
-    within = [(t >= clock[0]) & (t <= last) for t in stamps]
-    in_gap = 0
-    if columns == POSE:
-        joined = ~streams.is_gap(clock)
-        covered = [streams.between_lines(clock, t, joined) for t in stamps]
-        in_gap = sum(int((w & ~c).sum()) for w, c in zip(within, covered, strict=True))
-        within = [w & c for w, c in zip(within, covered, strict=True)]
+        end += np.max(np.diff(clock), initial=0.0)
+
+    # The measurements at whose time there is odometry.
+    dropped = dict.fromkeys(_DROPPED, 0)
+    inside = []
+    for seen in sensors:
+        when = seen.table.columns[TIME]
+        within = (when >= clock[0]) & (when <= end)
+        joined = within
+        if columns == POSE:
+            joined = within & streams.between_lines(clock, when, ~streams.is_gap(clock))
+        dropped[_OUTSIDE] += int((~within).sum())
+        dropped[_IN_GAP] += int((within & ~joined).sum())
+        inside.append(joined)
+
+    # Tags of the names of their landmarks.
     named = {
         name
-        for seen, inside in zip(sensors, within, strict=True)
-        for name, kept in zip(seen.table.tags or (), inside, strict=False)
+        for seen, is_inside in zip(sensors, inside, strict=True)
+        for name, kept in zip(seen.table.tags or (), is_inside, strict=False)
         if kept
     }
     tag_of = {name: tag for tag, name in enumerate(sort_names({*names, *named}))}
-    tags = [_tags_in_scans(seen, tag_of) for seen in sensors]
-    # Those in a gap are outside of `within`, too, but have a count of their own.
-    kept, outside, negative, beyond, soon = [], -in_gap, 0, 0, 0
-    for seen, tag, inside in zip(sensors, tags, within, strict=True):
+    tags = [seen.tags_in_scans(tag_of) for seen in sensors]
+
+    # Of these measurements, those that say something.
+    used_streams = []
+    for seen, tag, is_inside in zip(sensors, tags, inside, strict=True):
         when = seen.table.columns[TIME]
-        lost = np.flatnonzero(inside & ~np.isin(when, clock))
+        lost = np.flatnonzero(is_inside & ~np.isin(when, clock))
         if lost.size and rule is streams.as_recorded:
             raise seen.table.error(
                 int(lost[0]),
@@ -176,106 +251,22 @@ def align_tables(
                 f"expected a time of the odometry, since {', '.join(columns)} cannot be divided, "
                 f"got {when[lost[0]]:.12g}; poses can: {TIME}, {', '.join(POSE)}",
             )
-        values = seen.table.values(seen.measured)
-        ranges = [k for k, name in enumerate(seen.measured) if split_unit(name)[0] == "range"]
-        no_echo = inside & (values[:, ranges] < 0).any(axis=1)
-        far = inside & (values[:, ranges] >= seen.max_range).any(axis=1)
-        used = inside & ~no_echo & ~far
-        early = used & _is_too_soon(seen, tag, used)
-        used &= ~early
-        kept.append((when[used], tag[used], values[used]))
-        outside += int((~inside).sum())
-        negative += int(no_echo.sum())
-        beyond += int(far.sum())
-        soon += int(early.sum())
-    times = np.unique(np.concatenate([clock, *(when for when, *_ in kept)]))
+        unused = seen.unused(tag, is_inside)
+        for reason, mask in unused.items():
+            dropped[reason] += int(mask.sum())
+        used = is_inside & ~np.logical_or.reduce(list(unused.values()))
+        used_streams.append((when[used], tag[used], seen.table.values(seen.measured)[used]))
+
+    # A row at every time, with the slots of the sensors side by side.
+    times = np.unique(np.concatenate([clock, *(when for when, *_ in used_streams)]))
     moved = clock, odometry.values(columns)
-    places = [seen.places for seen in sensors]
-    rows = _join_slots(
-        [streams.align_streams(moved, stream, rule, times) for stream in kept], places
-    )
+    scans = [streams.align_streams(moved, stream, rule, times) for stream in used_streams]
+    rows = streams.join_slots(scans, [seen.places for seen in sensors])
     if INTERVAL in controls and rule is not streams.hold:
         interval = np.diff(rows.time, prepend=rows.time[:1])
         rows = rows._replace(control=np.column_stack([rows.control, interval]))
-    dropped = {"measurements outside the odometry": outside}
-    counts = {
-        "measurements in a gap of the odometry": in_gap,
-        "measurements with a range below 0": negative,
-        "measurements of the maximum range": beyond,
-        "measurements closer than the spacing": soon,
-    }
-    dropped |= {reason: count for reason, count in counts.items() if count}
-    return Aligned(rows, tuple(tag_of), dropped)
-
-
-def _tags_in_scans(seen: Seen[_Name], tag_of: dict[_Name, int]) -> Int[np.ndarray, "J"]:
-    """The tag of each measurement of a sensor, -1 where unknown; ValueError as `align_tables`."""
-    table, when = seen.table, seen.table.columns[TIME]
-    check_times(table, strict=False)
-    named = table.tags or [None] * len(when)
-    tags = [-1 if name is None else tag_of.get(name, -1) for name in named]
-    scan: set[tuple[float, int]] = set()
-    for row, pair in enumerate(zip(when.tolist(), tags, strict=True)):
-        if pair[1] >= 0 and pair in scan:
-            raise table.error(
-                row,
-                TAG,
-                f"expected a tag once at a time, got {named[row]!r} twice at t = {pair[0]:.12g}",
-            )
-        scan.add(pair)
-    if (
-        seen.places is not None
-        and (late := np.flatnonzero(when[seen.places :] == when[: -seen.places])).size
-    ):
-        raise table.error(
-            int(late[0]) + seen.places,
-            TIME,
-            f"expected at most {seen.places} measurement{'s' * (seen.places > 1)} at a time, the "
-            "slots of the sensor, got more",
-        )
-    return np.array(tags, np.int64)
-
-
-def _is_too_soon(
-    seen: Seen[_Name], tag: Int[np.ndarray, "J"], used: Bool[np.ndarray, "J"]
-) -> Bool[np.ndarray, "J"]:
-    """Mask of the measurements sooner after one of the same landmark than the spacing."""
-    too_soon = np.zeros(len(tag), bool)
-    if not seen.spacing:
-        return too_soon
-    if unknown := np.flatnonzero(used & (tag < 0)).tolist():
-        reason = "expected a tag, since a spacing is of one landmark, got none"
-        raise seen.table.error(unknown[0], TAG, reason)
-    when = seen.table.columns[TIME]
-    last: dict[int, float] = {}
-    for row in np.flatnonzero(used):
-        # A spacing of whole intervals is not to be missed by rounding of the stamps.
-        too_soon[row] = when[row] - last.get(tag[row], -math.inf) < seen.spacing * (1 - 1e-6)
-        if not too_soon[row]:
-            last[tag[row]] = when[row]
-    return too_soon
-
-
-def _join_slots(scans: Sequence[streams.Rows], places: Sequence[int | None]) -> streams.Rows:
-    """Rows at the same times with the slots of several sensors, each padded to its places, and z to
-    the longest."""
-    size = max(rows.z.shape[2] for rows in scans)
-
-    def pad(rows: streams.Rows, count: int | None) -> streams.Rows:
-        spare = 0 if count is None else count - rows.tag.shape[1]
-        slots = (0, 0), (0, spare)
-        return rows._replace(
-            z=np.pad(rows.z, (*slots, (0, size - rows.z.shape[2]))),
-            tag=np.pad(rows.tag, slots, constant_values=-1),
-            valid=np.pad(rows.valid, slots),
-        )
-
-    blocks = [pad(*pair) for pair in zip(scans, places, strict=True)]
-    z, tag, valid = (
-        np.concatenate([getattr(rows, name) for rows in blocks], axis=1)
-        for name in ("z", "tag", "valid")
-    )
-    return streams.Rows(scans[0].time, scans[0].control, z, tag, valid)
+    counts = {reason: n for reason, n in dropped.items() if n or reason == _OUTSIDE}
+    return Aligned(rows, tuple(tag_of), counts)
 
 
 def check_times(table: Columns[_Name], *, strict: bool) -> None:
