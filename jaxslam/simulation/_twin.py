@@ -106,7 +106,7 @@ class Twin(World):
         # Without a sensor of absolute poses only a rigid motion of all is uncertain at the start.
         frame = se2.compose(start, se2.inverse(pose))
         points = jnp.asarray(self.landmarks, dtype)
-        landmarks = jax.vmap(self.sensor.carried, (None, 0))(frame, points)
+        landmarks = jax.vmap(self.sensor.move_landmark, (None, 0))(frame, points)
         normals = normals_like(key_motion, jnp.asarray(self.noise, dtype))
         poses, logged = self.drive(start, normals)
         seen = jnp.asarray(self.seen, jnp.int32)
