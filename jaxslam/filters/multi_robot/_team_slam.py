@@ -187,10 +187,8 @@ def _correct_by_robot(filter: TeamSlam, joint: Joint, robot: int, scan: Scan) ->
     others = jnp.where(jnp.arange(len(in_map)) == robot, False, in_map)
     # Measurements of a robot without a pose in the map, and all by one, cannot correct.
     unknown = (of_robot & ~others[None, :]).any(axis=1) | ~in_map[robot]
-    sensors, is_robot = (
-        filter.robots[robot].sensors,
-        jnp.arange(len(joint.alive)) >= filter.capacity,
-    )
+    sensors = filter.robots[robot].sensors
+    is_robot = jnp.arange(len(joint.alive)) >= filter.capacity
     scans = split_scan(scan._replace(valid=scan.valid & ~unknown), sensors.places)
     parts = []
     for part, part_scan in zip(sensors.parts, scans, strict=True):
