@@ -119,7 +119,7 @@ class Twin(World):
         # Without a sensor of absolute poses only a rigid motion of all is uncertain at the start.
         frame = se2.compose(start[:3], se2.inverse(pose[:3]))
         points = jnp.asarray(self.landmarks, dtype)
-        landmarks = jax.vmap(self.sensor.carried, (None, 0))(frame, points)
+        landmarks = jax.vmap(self.sensor.move_landmark, (None, 0))(frame, points)
         normals = normals_like(key_motion, jnp.asarray(self.noise, dtype))
         robots, logged = self.drive(start, normals)
         is_pose = len(self.motion.state) == 3
