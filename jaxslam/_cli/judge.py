@@ -192,7 +192,12 @@ def _judge_estimates(options: argparse.Namespace, command: str) -> int:
             world,
             {
                 name: folder_source(
-                    folder, draws, world.sensor.measurements, options.stride, failures
+                    folder,
+                    draws,
+                    world.sensor.measurements,
+                    options.stride,
+                    failures,
+                    world.motion.state,
                 )
                 for name, folder in folders.items()
             },

@@ -18,6 +18,7 @@ from jaxslam.consistency._intervals import LEVEL, Average, percentage
 from jaxslam.consistency._measures.nees import DOF
 from jaxslam.consistency._verdict import TOLERANCE
 from jaxslam.consistency.metrics._paths import alignment
+from jaxslam.core._table import Row, Table, text_of
 from jaxslam.core._units import are_headings_in_degrees
 from jaxslam.core.logs._streams import geodesic_poses, known_poses
 from jaxslam.core.validation import (
@@ -134,50 +135,45 @@ class RecordingScores:
     doubts: tuple[str, ...]
     """sentences that qualify the verdict, and on alignment and lag"""
 
-    def rows(self) -> list[tuple[str, str, str, str]]:
-        """The table: label, value with interval, honest value, number of independent errors."""
+    def rows(self) -> list[Row]:
+        """The table: label; value with interval, honest value, number of independent errors."""
         time = self.errors.time
         span = time[-1] - time[0]
         rows = [
-            ("", f"value [{percentage(LEVEL)}]", "honest", "independent errors"),
-            ("verdict", self.verdict + "*" * bool(self.doubts), "consistent", ""),
-            ("poses compared", f"{len(time):,} over {span:,.4g} s", "", ""),
+            Row("verdict", [self.verdict + "*" * bool(self.doubts), "consistent", ""]),
+            Row("poses compared", [f"{len(time):,} over {span:,.4g} s", "", ""]),
         ]
         for name, block in self.blocks.items():
             honest = _range_text(block.honest)
             count = f"{block.independent:,.0f} of {block.poses:,}"
-            rows.append((f"NEES, {name}", _text(block.nees), honest, count))
+            rows.append(Row(f"NEES, {name}", [_text(block.nees), honest, count]))
         for name, block in self.blocks.items():
             for level, share in block.coverage.items():
                 ends = tuple(100 * end for end in block.honest_coverage[level])
-                label = f"within the {percentage(level)} set, {name} [%]"
-                rows.append((label, _text(share, 100.0), _range_text(ends), ""))
+                label = f"within the {percentage(level)} set, {name}"
+                rows.append(Row(label, [_text(share, 100.0), _range_text(ends), ""], "%"))
         for name, factor in self.factors.items():
-            rows.append((f"σ too small by, {name}", _text(factor), "1", ""))
+            rows.append(Row(f"σ too small by, {name}", [_text(factor), "1", ""]))
         for name in COMPONENTS:
             unit, scale = ("°", np.rad2deg(1.0)) if name == "heading" else ("m", 1.0)
-            rows.append((f"RMSE, {name} [{unit}]", f"{scale * self.rmse[name]:.3g}", "", ""))
-            rows.append((f"mean error, {name} [{unit}]", _text(self.mean[name], scale), "", ""))
+            rows.append(Row(f"RMSE, {name}", [f"{scale * self.rmse[name]:.3g}", "", ""], unit))
+            rows.append(Row(f"mean error, {name}", [_text(self.mean[name], scale), "", ""], unit))
         if self.lag is not None:
-            rows.append(("lag of the estimate [ms]", _text(self.lag.seconds, 1e3), "0", ""))
-            rows.append(("  its standard error", f"{1e3 * self.lag.error:.2g}", "", ""))
+            rows.append(Row("lag of the estimate", [_text(self.lag.seconds, 1e3), "0", ""], "ms"))
+            rows.append(Row("  its standard error", [f"{1e3 * self.lag.error:.2g}", "", ""]))
             for name, nees in self.lag.nees.items():
                 honest = _range_text(self.blocks[name].honest)
-                rows.append((f"  NEES without it, {name}", _text(nees), honest, ""))
+                rows.append(Row(f"  NEES without it, {name}", [_text(nees), honest, ""]))
             if self.lag.nees:
-                rows.append(("  verdict without it", self.lag.verdict, "", ""))
+                rows.append(Row("  verdict without it", [self.lag.verdict, "", ""]))
         return rows
 
     def __str__(self) -> str:
-        rows = self.rows()
-        widths = [max(len(row[k]) for row in rows) for k in range(4)]
-        lines = [
-            "  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]).rstrip()
-            for row in rows
-        ]
+        heads = "", f"value [{percentage(LEVEL)}]", "honest", "independent errors"
         dropped = [f"{count:,} of the poses: {reason}" for reason, count in self.dropped.items()]
         doubts = [f"* {doubt}" for doubt in self.doubts]
-        return "\n".join([*lines, *([""] * bool(dropped or doubts)), *dropped, *doubts])
+        table = text_of(Table(heads, self.rows()))
+        return "\n".join([table, *([""] * bool(dropped or doubts)), *dropped, *doubts])
 
 
 def judge_recording(

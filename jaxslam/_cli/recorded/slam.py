@@ -13,6 +13,7 @@ from jaxslam._cli.recorded import laser_log
 from jaxslam._cli.recorded.memory import memory_returned, trim
 from jaxslam.consistency import metrics
 from jaxslam.consistency.campaign._progress import Progress
+from jaxslam.core._table import csv_text
 from jaxslam.core.types import Estimate
 from jaxslam.core.validation import InvalidField
 from jaxslam.datasets import LaserLog, relation_file
@@ -23,7 +24,7 @@ from jaxslam.laser.laser_slam import LoopOutcome, Settings, Solved
 from jaxslam.laser.laser_slam._log_map import growing_maps
 from jaxslam.math.stats import chi2_quantile
 from jaxslam.results import report
-from jaxslam.results._files import Files, Json, csv_text
+from jaxslam.results._files import Files, Json
 
 if TYPE_CHECKING:  # Matplotlib is slow to load
     from jaxslam.results.plot import Film

@@ -255,6 +255,7 @@ class _Judgement:
             [outcome.estimate for outcome in outcomes],
             jax.tree.map(lambda *leaves: np.stack(leaves), *truths),
             shape,
+            self.plan.scenario.motion.state,
             self.plan.scenario.sensor,
             self.plan.devices[0],
             self.plan.wide,
