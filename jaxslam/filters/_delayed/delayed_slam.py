@@ -169,6 +169,7 @@ def _store_measurements(
 
     joint = state.joint
     place, stored = slots.allocate(joint.alive[layout.of_stored], wanted)
+    # R at z, as there is no prediction; with a hypothesis there is one (`StoredNoise`).
     noise_cov = jax.vmap(filter.sensor_of_table.noise_cov)(new.z)
     stored_cov = jnp.einsum("mij,mjk,mlk->mil", by_z, noise_cov, by_z)
     slot = layout.first_stored + place
@@ -177,7 +178,8 @@ def _store_measurements(
     state = state._replace(
         joint=joint,
         taken_at=state.taken_at.at[at].set(state.clock, mode="drop"),
-        noise_var=state.noise_var.at[at].set(stored_cov[:, 2, 2], mode="drop"),
+        z=state.z.at[at].set(new.z, mode="drop"),
+        by_z=state.by_z.at[at].set(by_z[:, 2, 0], mode="drop"),
         counts=state.counts._replace(evicted=add_to(state.counts.evicted, evicted)),
     )
     return state, slot, stored
