@@ -3,11 +3,13 @@ covariances that a recorded robot published."""
 
 import argparse
 import re
+import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
 
 import jax
+import numpy as np
 
 from jaxslam._cli import cache
 from jaxslam._cli.campaigns.estimator_runs import Programs
@@ -22,7 +24,9 @@ from jaxslam.core._names import closest_name
 from jaxslam.core.validation import at_least, or_none, positive, require
 from jaxslam.datasets._judged_folders import DrawsFolder, folder_source, read_draws, run_name
 from jaxslam.results import _campaign_files as campaign_files
-from jaxslam.results._campaign_files import FORMATS
+from jaxslam.results import store
+from jaxslam.results._block_files import MANIFEST
+from jaxslam.results._campaign_files import BLOCKS, FORMATS, JUDGED
 
 FOLDER = "estimates"
 """Default folder of the estimates that the command computes."""
@@ -170,6 +174,10 @@ def _judge_estimates(options: argparse.Namespace, command: str) -> int:
                 raise ValueError(f"--compare: expected two {counted} or more, got {count}")
     devices = chosen_devices(options.devices)
     check_out(options.out, "judge")
+    blocks = options.out / BLOCKS
+    if (blocks / MANIFEST).exists() and store.resume(blocks).settings != JUDGED:
+        raise ValueError(f"--out: {options.out} holds a campaign: choose another folder")
+    columns: dict[str, np.ndarray] = {}
     failures: dict[int, RunFault] = {}
     if options.estimator is not None:
         if len(folders) > 1:
@@ -194,13 +202,19 @@ def _judge_estimates(options: argparse.Namespace, command: str) -> int:
             stride=options.stride,
             bound=options.bound,
             devices=devices,
+            save=columns.update,
         )
     campaign = replace(campaign, reference=options.compare or "")
     print(campaign)
+    # The numbers first: what an interrupted command leaves has no runs of another campaign.
+    shutil.rmtree(blocks, ignore_errors=True)
     failed: list[str] = []
     paths = campaign_files.save_campaign(
         campaign, options.out, formats, True, command, None, failed.append
     )
+    kept = store.open(blocks, JUDGED, campaign.runs)
+    kept.claim({"filters": ", ".join(campaign.filters), "steps": str(campaign.steps)})
+    kept.save(0, columns, campaign.runs)
     print("\nwrote " + ", ".join(map(str, paths)))
     for sentence in failed:
         print(f"jaxslam: {sentence}", file=sys.stderr)

@@ -90,6 +90,7 @@ def summary_of(check: ModelCheck) -> Json:
     return {
         "twins": check.twins,
         "left out": check.left_out,
+        "doubt": check.doubt,
         "findings": list(check.findings),
         "statistics": [
             {

@@ -2,16 +2,19 @@
 
 World, filters and key are data, so it is their structure and their numbers, bit by bit, with the
 versions and a digest of the package's source. Of classes and functions outside the package it is
-their code too, with what that refers to: an edited line of a user's model is another campaign; a
-comment or a renamed file is not. Not seen: what other packages compute, and flags of XLA.
+their source too, with what that refers to: an edited line of a user's model is another campaign; a
+comment, a docstring, a renamed file and another version of Python are not. Not seen: what other
+packages compute, and flags of XLA.
 """
 
+import ast
 import dataclasses
 import functools
 import hashlib
 import importlib.resources
 import inspect
-from collections.abc import Mapping
+import linecache
+from collections.abc import Iterator, Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from types import CodeType, FunctionType
@@ -116,13 +119,76 @@ def _text(value: object, within: tuple[object, ...]) -> str:
         bound = _text(getattr(value, "__self__", None), within)
         if not _of_user(inner) or inner in within:
             return f"{bound} {_name(inner)}"
-        closure = inspect.getclosurevars(inner)
-        values = {**closure.globals, **closure.nonlocals}
-        parts = (inner.__code__, inner.__defaults__, inner.__kwdefaults__, values)
-        return f"{bound} {_text(parts, (*within, inner))}"
-    if isinstance(value, CodeType):
-        return str([value.co_code.hex(), value.co_names, _text(value.co_consts, within)])
+        codes = list(_codes(inner.__code__))
+        used = {name for code in codes for name in code.co_names} & inner.__globals__.keys()
+        values = {name: inner.__globals__[name] for name in used}
+        values |= inspect.getclosurevars(inner).nonlocals
+        parts = (inner.__defaults__, inner.__kwdefaults__, values)
+        return f"{bound} {_source_of(inner)} {_text(parts, (*within, inner))}"
     return _name(value)
+
+
+def _codes(code: CodeType) -> Iterator[CodeType]:
+    """The code of a function, and of the functions in it."""
+    yield code
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            yield from _codes(constant)
+
+
+def _source_of(function: FunctionType) -> str:
+    """The source of a function without comments, docstrings and layout.
+
+    Of code that no file has, as of `exec`, it is the bytecode, which differs between versions of
+    Python.
+    """
+    code = function.__code__
+    text = "".join(linecache.getlines(code.co_filename, function.__globals__))
+    nodes = _functions(text).get((code.co_firstlineno, code.co_name), [])
+    if len(nodes) > 1:  # lambdas of one line: the innermost in which every instruction lies
+        columns = [c for line, _, c, end in code.co_positions() if line and c is not None and end]
+        around = [
+            node
+            for node in nodes
+            if all(node.col_offset <= c <= (node.end_col_offset or 0) for c in columns)
+        ]
+        nodes = sorted(around, key=lambda node: node.col_offset)[-1:] or nodes
+    if nodes:
+        return "; ".join(map(_syntax, nodes))
+    parts = [
+        (part.co_code.hex(), part.co_names, [c for c in part.co_consts if type(c) is not CodeType])
+        for part in _codes(code)
+    ]
+    return _text(parts, ())
+
+
+def _syntax(value: object) -> str:
+    """A syntax tree as text: `ast.dump` and `ast.unparse` differ between versions of Python."""
+    if isinstance(value, ast.AST):
+        fields = [(name, part) for name, part in ast.iter_fields(value) if part not in (None, [])]
+        return f"{type(value).__name__}({', '.join(f'{n}={_syntax(part)}' for n, part in fields)})"
+    if isinstance(value, list):
+        return f"[{', '.join(map(_syntax, value))}]"
+    return repr(value)
+
+
+@functools.lru_cache(maxsize=8)
+def _functions(text: str) -> dict[tuple[int, str], list[ast.FunctionDef | ast.Lambda]]:
+    """The functions of a source file without docstrings, by first line and name."""
+    functions: dict[tuple[int, str], list[ast.FunctionDef | ast.Lambda]] = {}
+    try:
+        tree = ast.parse(text)
+    except SyntaxError:  # a cell with commands of its own
+        return functions
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Lambda):
+            functions.setdefault((node.lineno, "<lambda>"), []).append(node)
+        elif isinstance(node, ast.FunctionDef):
+            if ast.get_docstring(node) is not None:
+                node.body = node.body[1:] or [ast.Pass()]
+            first = min([node.lineno, *(part.lineno for part in node.decorator_list)])
+            functions.setdefault((first, node.name), []).append(node)
+    return functions
 
 
 def _text_of_class(cls: type, within: tuple[object, ...]) -> str:

@@ -200,12 +200,27 @@ def _correlations(run: FusedInnovations, sensor: Sensor, rates: Rates) -> Iterat
 def _tails(run: FusedInnovations, sensor: Sensor) -> Iterator[Statistic]:
     """The tails of the distribution of the innovations, whatever their size."""
     size = run.nu.shape[1]
-    beyond = int((size * run.nis > chi2_quantile(_TAIL, size) * _mean(run.nis)).sum())
+    beyond = tail_count(np.sort(size * run.nis), float(chi2_quantile(_TAIL, size)) * _mean(run.nis))
     yield _count("tail", "above the 99 % quantile", beyond, max(len(run.nis), 1))
     for i, name in enumerate(_names(sensor)):
         square = _mean(run.unit[:, i] ** 2)
         kurtosis = _mean(run.unit[:, i] ** 4) / square**2 if square > 0 else np.nan
         yield _positive("kurtosis", name, kurtosis)
+
+
+def tail_count(increasing: Float[np.ndarray, "N"], limit: float) -> float:
+    """The number of values above a limit, interpolated linearly between the two beside it.
+
+    From n values above it falls to n - 1 as the least of them falls to the limit: whole numbers
+    have ties among twins, which no rank resolves. Below the largest value it is that value over the
+    limit - 1, at least -1.
+    """
+    above = len(increasing) - int(np.searchsorted(increasing, limit, side="right"))
+    if above == 0:
+        return float(increasing[-1]) / limit - 1.0 if len(increasing) and limit > 0 else -1.0
+    least = float(increasing[-above])
+    below = float(increasing[-above - 1]) if above < len(increasing) else 0.0
+    return above - 1 + (least - limit) / (least - below)
 
 
 def _faults(info: Info, shapes: tuple[list[Shape], list[Shape]]) -> Iterator[Statistic]:
@@ -269,10 +284,13 @@ def _positive(family: str, detail: str, value: float) -> Statistic:
     return Statistic(family, detail, float(value), score)
 
 
-def _count(family: str, detail: str, count: int, total: int) -> Statistic:
-    """A share; twice the root of a count has a deviation near 1 (Anscombe 1948)."""
-    score = 2 * float(np.sqrt(count + 0.375))
-    return Statistic(family, detail, count / total, score, spread=1.0)
+def _count(family: str, detail: str, count: float, total: int) -> Statistic:
+    """A share; twice the root of a count has a deviation near 1 (Anscombe 1948).
+
+    Below 0, where an interpolated count has no event, the score goes on as a line.
+    """
+    score = 2 * float(np.sqrt(max(count, 0.0) + 0.375)) + min(count, 0.0)
+    return Statistic(family, detail, max(count, 0.0) / total, score, spread=1.0)
 
 
 def _largest(

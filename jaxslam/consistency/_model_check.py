@@ -60,6 +60,10 @@ ALPHA = 1 - LEVEL
 LEAST = 20
 """Least number of twins: with fewer their spread is not known."""
 
+_LOST = 1.5
+"""NIS / dof of the twins, or its inverse, from which on a filter is lost: an honest filter has 1,
+and so has an EKF whose pose NEES is three times too large (*Lost in the woods*)."""
+
 _PLANTED = 28
 """Logs with planted faults, which are one block if that is not larger than those of twins."""
 
@@ -112,6 +116,18 @@ class ModelCheck:
         """What contradicts the models, worst first; () where nothing does."""
         return tuple(row.finding for row in self.statistics if row.contradicts)
 
+    @property
+    def doubt(self) -> str:
+        """Why the statistics say little; "" where they do."""
+        size = next((row.twins for row in self.statistics if row.statistic.name == "NIS / dof"), 1)
+        median = float(np.median(size))
+        if 1 / _LOST < median < _LOST:
+            return ""
+        return (
+            f"the filter is lost on logs of its own models, with NIS / dof {median:.3g}: what fits "
+            "says little; take another filter"
+        )
+
     def __repr__(self) -> str:
         return (
             f"ModelCheck({self.name}, {self.filter}, {self.twins} twins, "
@@ -129,6 +145,8 @@ class ModelCheck:
                 f"  {self.left_out:,} measurements have no landmark in the smoothed map, and no "
                 "twin; if the filter was lost there, path and map of the twins are too"
             )
+        if self.doubt:
+            lines.append(f"  {self.doubt}")
         rejected = [row for row in self.statistics if row.contradicts]
         if not rejected:
             return "\n".join(

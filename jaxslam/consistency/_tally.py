@@ -161,6 +161,13 @@ class Tally:
         """The numbers of the runs (runs,), in order."""
         return _joined(np.arange(first, first + runs) for first, runs in self.pieces())
 
+    def block(self) -> dict[str, np.ndarray]:
+        """What `add` takes of all runs at once: their sums and arrays by name."""
+        arrays = next(iter(self._blocks.values()))
+        kept = {name: self._all(name) if value.ndim else value for name, value in arrays.items()}
+        high = {f"high/{name}": value.high for name, value in self._sums.items()}
+        return kept | high | {f"low/{name}": value.low for name, value in self._sums.items()}
+
     def flags(self, name: str) -> np.ndarray:
         """Whether each run is finite, inaccurate, or divergent: flags (runs,)."""
         return self._all(name)

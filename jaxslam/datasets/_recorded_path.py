@@ -139,7 +139,7 @@ def _path_in_csv(path: Path) -> RecordedPath:
         )
     columns = file.table((*wanted, *entries), "of a path", optional=COVARIANCE)
     time = columns.columns[wanted[0]]
-    _check_rising(time, lambda row: columns.at(row, wanted[0]))
+    _check_times(time, lambda row: columns.at(row, wanted[0]))
     pose = columns.values(wanted[1:])
     notes = [file.dialect] if file.dialect else []
     if are_headings_in_degrees(pose):
@@ -166,7 +166,7 @@ def _path_in_tum(path: Path) -> RecordedPath:
     if not rows:
         raise file.end_error(f"expected lines {' '.join(TUM)}, got none")
     table = np.array(rows)
-    _check_rising(table[:, 0], lambda row: f"{file.path}:{numbers[row]}")
+    _check_times(table[:, 0], lambda row: f"{file.path}:{numbers[row]}")
     pose = planar(table[:, 1:])
     if not (finite := np.isfinite(pose).all(axis=1)).all():
         row = int(np.argmin(finite))
@@ -174,8 +174,17 @@ def _path_in_tum(path: Path) -> RecordedPath:
     return _make_path(str(path), table[:, 0], pose, None)
 
 
-def _check_rising(time: Float[np.ndarray, "K"], at: Callable[[int], str]) -> None:
-    """Raise ValueError, with the place of a row by `at`, unless times rise."""
+_LATEST = 1e11
+"""[s] after 1970 that is the year 5138; stamps of now have 1.8e12 ms."""
+
+
+def _check_times(time: Float[np.ndarray, "K"], at: Callable[[int], str]) -> None:
+    """Raise ValueError, with the place of a row by `at`, unless times are seconds and rise."""
+    if late := np.flatnonzero(np.abs(time) > _LATEST).tolist():
+        raise ValueError(
+            f"{at(late[0])}: expected a time in seconds, got {time[late[0]]:.4g}: name the column "
+            "of a CSV t [ns], t [us] or t [ms], or divide"
+        )
     back = np.flatnonzero(np.diff(time) <= 0)
     if back.size:
         before, after = time[back[0] : back[0] + 2].tolist()

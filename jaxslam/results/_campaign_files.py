@@ -39,6 +39,9 @@ TIMES = ("seconds", "compile_seconds", "step_seconds")
 BLOCKS = "blocks"
 """The folder of a campaign's finished blocks, beside its results."""
 
+JUDGED = {"command": "jaxslam judge"}
+"""Settings of the store of judged runs, which no command continues."""
+
 FORMATS = ("png", "pdf", "svg")
 """Formats of the files of figures."""
 
@@ -143,7 +146,7 @@ def save_campaign(
 
 
 def load(folder: str | Path) -> Campaign:
-    """The finished campaign in a folder written by `jaxslam consistency`.
+    """The finished campaign in a folder written by `jaxslam consistency` or `jaxslam judge`.
 
         campaign = jaxslam.load("out")
         jaxslam.plot.nees_figure(campaign, width=3.5).savefig("nees.pdf")
@@ -157,18 +160,19 @@ def load(folder: str | Path) -> Campaign:
     folder = Path(folder)
     if not (folder / BLOCKS).is_dir():
         reason = f"there is no campaign in {folder}: expected {BLOCKS}/ there"
-        if (folder / RESULT).exists():  # of `jaxslam judge`, or of `Campaign.save`
-            reason += ", the runs, which jaxslam consistency alone keeps"
+        if (folder / RESULT).exists():
+            reason += ", the runs, which Campaign.save does not keep"
         raise InvalidField("", reason, owner="jaxslam.load")
     kept, path = store.resume(folder / BLOCKS), folder / RESULT
     try:
         result = json.loads(path.read_text(encoding="utf-8"))
+        faults, run_seconds, notes = _judgement_of(result)
         doubts, reference = _doubts_of(result, kept.campaign), reference_of(result)
     except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
-        raise ValueError(
-            f"{path}: expected the results of a campaign: jaxslam consistency --resume {folder} "
-            "writes them"
-        ) from error
+        remedy = f"jaxslam consistency --resume {folder} writes them"
+        if kept.settings == JUDGED:
+            remedy = "judge again"
+        raise ValueError(f"{path}: expected the results of a campaign: {remedy}") from error
     runs, tallies = result["runs"], {name: Tally() for name in (*doubts, BOUND)}
     if missing_pieces(add_kept(tallies, kept, runs, lambda first: True), runs, runs):
         raise ValueError(
@@ -181,10 +185,13 @@ def load(folder: str | Path) -> Campaign:
         runs=runs,
         divergence_limit=float(limit),
         filters={
-            name: replace(summary, doubts=doubts[name]) for name, summary in summaries.items()
+            name: replace(summary, doubts=doubts[name], faults=faults[name])
+            for name, summary in summaries.items()
         },
         run_numbers=tallies[BOUND].numbers(),
         reference=reference,
+        run_seconds=run_seconds,
+        notes=notes,
     )
 
 
@@ -210,6 +217,26 @@ def _doubts_of(result: Any, campaign: Mapping[str, str]) -> dict[str, tuple[str,
     ):
         raise ValueError("not the results of this campaign")
     return doubts
+
+
+def _judgement_of(
+    result: Any,
+) -> tuple[dict[str, dict[str, tuple[int, ...]]], dict[str, float], tuple[str, ...]]:
+    """Faults by filter, seconds of a run and notes in the JSON of a report: of judged estimators.
+
+    Raises one of several errors if the JSON has them in another form.
+    """
+    faults = {
+        name: {str(reason): tuple(map(int, runs)) for reason, runs in entry["faults"].items()}
+        if "faults" in entry
+        else {}
+        for name, entry in result["filters"].items()
+    }
+    seconds = {str(name): float(value) for name, value in result.get("run_seconds", {}).items()}
+    notes = result.get("notes", [])
+    if not isinstance(notes, list) or not all(isinstance(note, str) for note in notes):
+        raise ValueError("not the notes of a campaign")
+    return faults, seconds, tuple(notes)
 
 
 def reference_of(result: Any) -> str:

@@ -78,7 +78,8 @@ class RangeBearingNoise:
     across: ArrayLike = 0.0
     """[m] standard deviation of the place across the line of sight"""
     equations = (
-        "# r: the range without noise, in a filter the predicted one; 0/0 is 0\n"
+        "# range and bearing are the numbers above, standard deviations; r is the range without\n"
+        "# noise, in a filter the predicted one; 0/0 is 0\n"
         "variance_of_n_range = range**2 + (share*r)**2\n"
         "variance_of_n_bearing = bearing**2 + across**2/(r**2 + across**2)"
     )

@@ -97,6 +97,18 @@ def test_our_ekf_by_files_has_the_numbers_of_the_campaign(
     assert {"report.html", "nees.png", "map.png"} <= {path.name for path in out.iterdir()}
 
 
+def assert_loaded_as_judged(out, again):
+    """The folder of `jaxslam judge` is read back with every number, fault and note."""
+    loaded = load(out)
+    loaded.save(again, figures=())
+    judged, saved = result(out), result(again)
+    for stored in (judged, saved):
+        del stored["command"], stored["seed"]
+    assert saved == judged
+    for name in ("consistency.csv", "measures.csv"):
+        assert (again / name).read_bytes() == (out / name).read_bytes()
+
+
 WORLDS = """
 import dataclasses
 import numpy as np
@@ -158,6 +170,7 @@ def test_times_are_matched_and_faults_are_named(draws, estimates, tmp_path, undr
     printed = " ".join(capsys.readouterr().out.split())
     assert "(run 1: trajectory.csv:8: t = 7.001)" in printed
     assert "1 missing (run 2: no trajectory.csv in it): averages of the 1 judged runs" in printed
+    assert_loaded_as_judged(tmp_path / "out", tmp_path / "again")
 
 
 @pytest.mark.parametrize(
@@ -306,10 +319,11 @@ def test_columns_are_compared_in_pairs(draws, estimates, tmp_path, undrawn, caps
         error[:, 2] = (error[:, 2] + np.pi) % (2 * np.pi) - np.pi
         gap.append(((error**2).sum(axis=1) * (1 / 0.04 - 1 / 0.01)).mean())
     assert nees["difference"]["value"] == pytest.approx(np.mean(gap), rel=1e-9)
-    with pytest.raises(
-        ValueError, match="blocks/ there, the runs, which jaxslam consistency alone"
-    ):
-        load(tmp_path / "out")
+    assert_loaded_as_judged(tmp_path / "out", tmp_path / "again")
+    assert run_command(["consistency", "--resume", tmp_path / "out"]) == 2
+    assert "holds the results of jaxslam judge: judge again" in capsys.readouterr().err
+    with pytest.raises(ValueError, match="the runs, which Campaign"):
+        load(tmp_path / "again")
 
 
 def change_line(path, number, text):

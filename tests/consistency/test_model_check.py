@@ -11,10 +11,10 @@ from cases import refused
 from scipy import stats
 
 from jaxslam import catalog, sensors
+from jaxslam.consistency import CheckedStatistic, ModelCheck, check_models
 from jaxslam.consistency import _log_statistics as log_statistics
 from jaxslam.consistency import _model_check as model_check
 from jaxslam.consistency import _planted_faults as planted_faults
-from jaxslam.consistency import check_models
 from jaxslam.core.types import Info, Status
 from jaxslam.results import plot
 from jaxslam.simulation import twin
@@ -124,8 +124,8 @@ def test_statistics_are_those_of_their_names():
     assert value["NIS trend"] == pytest.approx(np.corrcoef(nis, time[row])[0, 1])
     moments = stats.kurtosis(unit[:, 0], fisher=False)  # about the mean, which is small
     assert value["kurtosis, range"] == pytest.approx(moments, rel=0.02)
-    beyond = (2 * nis / nis.mean() > stats.chi2.ppf(0.99, 2)).mean()
-    assert value["tail, above the 99 % quantile"] == beyond
+    beyond = (2 * nis / nis.mean() > stats.chi2.ppf(0.99, 2)).sum()
+    assert beyond - 1 < len(nis) * value["tail, above the 99 % quantile"] <= beyond
     assert value["rejected by the gate"] == pytest.approx(1 / valid.sum())
     products, squares = 0.0, np.zeros(2)
     for slot in (0, 1):
@@ -133,6 +133,27 @@ def test_statistics_are_those_of_their_names():
         products += (of[3:] * of[:-3]).sum()
         squares += (of[3:] ** 2).sum(), (of[:-3] ** 2).sum()
     assert value["autocorrelation, lag 3"] == pytest.approx(products / np.sqrt(squares.prod()))
+
+
+def test_a_filter_that_is_lost_on_its_own_twins_is_doubted():
+    def check(nis):
+        size = log_statistics.Statistic("NIS / dof", "", nis, np.log(nis))
+        row = CheckedStatistic(size, np.full(20, nis), 10, 1.0, 1.0, 0.0, "")
+        return ModelCheck("yard", "ekf", 20, (row,))
+
+    assert not check(1.1).doubt and "lost" not in str(check(1.1))
+    assert "NIS / dof 320: what fits says little" in str(check(320.0)) and check(0.5).doubt
+
+
+def test_the_count_of_a_tail_falls_by_one_at_each_value():
+    values, limits = np.array([1.0, 2.0, 2.0, 5.0]), np.array([1.5, 2.0, 3.5, 5.0, 10.0])
+    counts = [log_statistics.tail_count(values, limit) for limit in limits]
+    np.testing.assert_allclose(counts, [2.5, 1.0, 0.5, 0.0, -0.5])
+    assert (
+        log_statistics.tail_count(values[:0], 1.0) == log_statistics.tail_count(values, 1e30) == -1
+    )
+    fine = [log_statistics.tail_count(values, limit) for limit in np.linspace(0.1, 9, 500)]
+    assert (np.diff(fine) <= 0).all()
 
 
 def test_the_amount_of_a_fault_is_that_of_weighted_least_squares():

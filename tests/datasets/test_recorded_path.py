@@ -182,6 +182,11 @@ HEAD = "time,x,y,theta\n"
     ),
     (
         "a.csv",
+        HEAD + "1700000000000000000,0,0,0\n1700000000100000000,0,0,0\n",
+        r"a.csv:2: column 1 .time.: expected a time in seconds, got 1.7e\+18: .* t \[ns\]",
+    ),
+    (
+        "a.csv",
         HEAD + "1,0,0,north\n",
         "a.csv:2: column 4 .theta.: expected a finite number, got 'north'",
     ),

@@ -17,7 +17,7 @@ from jaxslam.core.validation import at_least, or_none, require
 from jaxslam.results import _campaign_files as campaign_files
 from jaxslam.results import store
 from jaxslam.results._block_files import MANIFEST, is_unfinished, read_manifest
-from jaxslam.results._campaign_files import BLOCKS, RESULT
+from jaxslam.results._campaign_files import BLOCKS, JUDGED, RESULT
 from jaxslam.results._files import Json
 from jaxslam.simulation.scenarios import SCENARIOS
 
@@ -150,6 +150,8 @@ def _campaign(
         )
     kept = store.resume(folder / BLOCKS)
     stored = kept.settings.get("asked")
+    if kept.settings == JUDGED:
+        raise ValueError(f"--resume: {folder} holds the results of jaxslam judge: judge again")
     if not isinstance(stored, dict):
         raise ValueError(
             f"--resume: {folder} holds a campaign that was begun from Python; continue it there, "

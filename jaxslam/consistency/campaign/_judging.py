@@ -19,6 +19,7 @@ from jaxslam.consistency.campaign._block import BOUND, BlockRunner, CampaignPlan
 from jaxslam.consistency.campaign._block_programs import fitting_block
 from jaxslam.consistency.campaign._candidates import candidate_for, check_noise
 from jaxslam.consistency.campaign._harness import move_to_start, sum_up
+from jaxslam.consistency.campaign._kept import flatten
 from jaxslam.consistency.campaign._pieces import missing_pieces
 from jaxslam.consistency.campaign._progress import Progress
 from jaxslam.consistency.campaign._result import Campaign
@@ -165,8 +166,12 @@ def judge_sources(
     block: int | None = None,
     devices: Sequence[jax.Device] | None = None,
     progress: Callable[[int, int], None] | Literal[False] | None = None,
+    save: Callable[[dict[str, np.ndarray]], object] | None = None,
 ) -> Campaign:
-    """The campaign of estimators from elsewhere, by name, and of filters; see `judge_estimator`."""
+    """The campaign of estimators from elsewhere, by name, and of filters; see `judge_estimator`.
+
+    save: called with the arrays of all runs, as a store keeps them.
+    """
     with jax.transfer_guard("allow"):
         with refusals_of("judge_estimator"):
             _check(world, sources, runs, key, filters, stride, block)
@@ -197,13 +202,17 @@ def judge_sources(
             notes.insert(
                 0, f"judged at {campaign.steps:,} of {world.steps:,} steps, one in {stride}."
             )
-        return replace(
+        campaign = replace(
             campaign,
             filters=summaries,
             first={n: e.first for n, e in judged.items() if e.first is not None} | campaign.first,
             run_seconds={n: float(np.median(e.seconds)) for n, e in judged.items() if e.seconds},
             notes=tuple(notes),
         )
+        if save is not None:
+            blocks = {name: tally.block() for name, tally in tallies.items()}
+            save(flatten(blocks, tallies))
+        return campaign
 
 
 class _Judgement:

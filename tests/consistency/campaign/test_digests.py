@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import runpy
 import subprocess
 import sys
 
@@ -161,6 +162,49 @@ def test_a_digest_of_a_function_is_of_its_code_and_of_what_it_refers_to(monkeypa
     monkeypatch.setitem(globals(), "helped", lambda x: x + 2.0)
     assert len({digest, *others, digests.digest(made_by(2.0, table))}) == 5
     assert digests.digest(np.sin) != digests.digest(np.cos)
+
+
+SCALED = """
+import numpy as np
+FACTOR = {factor}
+def scaled(x):
+    {comment}
+    def inner(y):
+        return FACTOR * y  {aside}
+    return inner(x){end}
+first, second = (lambda x: x + 1), (lambda x: {last})
+"""
+SAME = {"factor": 2.0, "comment": '"""Of the author."""', "aside": "", "end": "", "last": "x + 2"}
+
+
+def digests_of_file(path, **text):
+    path.write_text(SCALED.format(**SAME | text))
+    module = runpy.run_path(str(path))
+    return [digests.digest(module[name]) for name in ("scaled", "first", "second")]
+
+
+def test_a_digest_of_a_function_is_of_its_source_without_comments_and_layout(tmp_path):
+    scaled, first, second = digests_of_file(tmp_path / "a.py")
+    assert len({scaled, first, second}) == 3
+    other = digests_of_file(tmp_path / "b.py", comment="# no docstring", aside="# scaled")
+    assert other == [scaled, first, second]
+    changes = [{"factor": 3.0}, {"end": " + 1"}, {"last": "x + 3"}]
+    changed = [digests_of_file(tmp_path / f"{i}.py", **text) for i, text in enumerate(changes)]
+    assert [[a != b for a, b in zip(row, other, strict=True)] for row in changed] == [
+        [True, False, False],
+        [True, False, False],
+        [False, False, True],
+    ]
+
+
+def test_a_digest_of_code_without_a_file_is_of_what_it_does():
+    def digest(text):
+        module = {}
+        exec(text, module)
+        return digests.digest(module["f"])
+
+    assert digest("f = lambda x: x + 1") == digest("f  =  lambda x:  x + 1")
+    assert digest("f = lambda x: x + 1") != digest("f = lambda x: x + 2")
 
 
 def test_a_digest_of_a_class_is_of_its_constants_methods_and_of_sets_in_its_code():
