@@ -246,4 +246,4 @@ def entropy(grid: Grid) -> Float[Array, "H W"]:
     odds = jnp.exp(-size)
     # The larger share is 1/(1 + odds), with -log of log1p(odds); the smaller has `size` more.
     nats = jnp.log1p(odds) + size * odds / (1 + odds)
-    return nats / math.log(2.0)
+    return jnp.asarray(nats / math.log(2.0))

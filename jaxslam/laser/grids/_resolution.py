@@ -69,10 +69,11 @@ def crop(grid: Grid, low: ArrayLike, high: ArrayLike) -> Grid:
             f"{width} × {height} of {grid.resolution} m",
             owner="crop",
         )
-    shift = [*(first * float(grid.resolution)), 0.0]
-    log_odds = grid.log_odds[first[1] : last[1], first[0] : last[0]]
     origin = jnp.asarray(grid.origin)
-    return Grid(log_odds, se2.compose(origin, jnp.asarray(shift, origin.dtype)), grid.resolution)
+    to_corner = [*(first * float(grid.resolution)), 0.0]
+    shift = jnp.asarray(to_corner, jnp.result_type(origin, float))
+    log_odds = grid.log_odds[first[1] : last[1], first[0] : last[0]]
+    return Grid(log_odds, se2.compose(origin, shift), grid.resolution)
 
 
 def correlation(a: Grid, b: Grid) -> Float[Array, ""]:
