@@ -71,7 +71,7 @@ def test_no_model_promotes_dtypes(strict, name, dtype):
             (model.noise_cov, z),
             (model.embed, pose[:3], pose[:2]),
             (model.position, landmark),
-            (model.carried, pose[:3], landmark),
+            (model.move_landmark, pose[:3], landmark),
             (model.observe_jacobians, pose, landmark),
             (model.invert_jacobians, pose, z, s),
         )

@@ -25,7 +25,7 @@ from jaxslam.core.validation import (
 )
 from jaxslam.graphs._factor import Factor, FromMotion, FromSensor, NominalMotion, Prior
 from jaxslam.graphs._graph import Graph, Table
-from jaxslam.linearize._first_order import motion_jacobians
+from jaxslam.linearize._first_order import motion_jacobians, nominal_path
 from jaxslam.math import _linalg as linalg
 from jaxslam.math import se2
 from jaxslam.sensors._suite import Suite, Wrapped
@@ -199,13 +199,7 @@ def _graph_of(
     sensor, kind = factor.sensor, jnp.result_type(log.control, log.scan.z)
     control, pose = log.control.astype(kind), pose.astype(kind)
     z = jnp.where(valid[:, :, None], log.scan.z.astype(kind), 0.0)
-    nominal = jnp.zeros(len(motion.noises), kind)
-
-    def move(before: Array, u: Array) -> tuple[Array, Array]:
-        after = motion.step(before, u, nominal)
-        return after, after
-
-    path = jnp.concatenate([pose[None], jax.lax.scan(move, pose, control)[1]])
+    path = jnp.concatenate([pose[None], nominal_path(motion, pose, control)])
     motion_cov = jax.vmap(motion.noise_cov)(path[:-1], control)
     by_noise = jax.vmap(lambda x, u: motion_jacobians(motion, x, u)[1])(path[:-1], control)
     moving = jnp.ones(len(control), bool)

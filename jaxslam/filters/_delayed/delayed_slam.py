@@ -8,6 +8,7 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxslam.core import slots
+from jaxslam.core._numbers import gate_quantile
 from jaxslam.core._record import record
 from jaxslam.core.types import Estimate, Info, Scan
 from jaxslam.filters._delayed.confirmation import confirm_hypotheses
@@ -77,15 +78,19 @@ class DelayedSlam(DelayedFilter):
         scan = scan._replace(z=jnp.where(scan.valid[:, None], scan.z, 0.0))
         state = state._replace(clock=state.clock + 1)
         ekf, sensor = self._ekf, self.sensor_of_table
-        # Hypotheses and stored measurements are not landmarks.
+        # Associate with the landmarks of the map; hypotheses and stored measurements are none.
         is_landmark = jnp.arange(self.layout.slots) < self.capacity
         landmarks = state.joint._replace(alive=state.joint.alive & is_landmark)
         association, matched = associate_scan(
             self.associate, sensor, scan, lambda: prediction_of(ekf, sensor, landmarks)
         )
+        # Correct, as EKF-SLAM does.
         slot = jnp.maximum(association.slot, 0)
-        joint, correction = correct_in_turn(ekf, sensor, state.joint, scan.z, slot, matched)
+        joint, correction = correct_in_turn(
+            ekf, sensor, state.joint, scan.z, slot, matched, gate_quantile(ekf.gate, 1)
+        )
         state = state._replace(joint=joint)
+        # Initialize: store, confirm, intersect, promote.
         is_new, tag = association.is_new, scan.tag
         repeated = slots.seen_before(tag, is_new) if self.by_tag else jnp.zeros_like(is_new)
         identity = tag if self.by_tag else jnp.full_like(tag, -1)
