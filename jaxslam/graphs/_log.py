@@ -168,7 +168,7 @@ def _points_of(
     if capacity is not None:
         require("capacity", capacity, at_least(1))
         used = valid & (array >= 0)
-        return array * used, used, np.arange(capacity, dtype=np.int32)
+        return array * used.astype(array.dtype), used, np.arange(capacity, dtype=np.int32)
     tagged = np.asarray(valid) & (np.asarray(array) >= 0)
     ids = np.unique(np.asarray(array)[tagged]).astype(np.int32)
     if not len(ids):
