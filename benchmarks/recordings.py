@@ -27,10 +27,10 @@ INTERVAL, LAG = 0.1, 0.05
 """Time between two poses, and the lag that is to be found [s]."""
 
 HOLDS = 0.90, 0.98
+"""Gate of the share of intervals of level 95 % that hold the truth."""
 RARE = 0.99
 """Upper gate of the coverage at 0.99: few independent errors of a recording lie outside, and its
 interval is wider than it need be."""
-"""Gate of the share of intervals of level 95 % that hold the truth."""
 
 
 class Recordings(NamedTuple):
