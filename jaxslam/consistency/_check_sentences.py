@@ -105,10 +105,8 @@ class Meaning:
         family, detail, value, place = statistic[:3] + (statistic.place,)
         if family == "fault":
             fault = self._faults[detail]
-            spread = fault.scale * float(np.std(twins))
-            shown = f"{fault.scale * value:.3g} {fault.unit} (twins ± {spread:.2g})"
             when = f" {self._window(place)}" if detail == "slip" else ""
-            return f"{fault.meaning.format(shown)}{when}; {fault.remedy}"
+            return f"{fault.says(value, float(np.std(twins)))}{when}; {fault.remedy}"
         typical = float(np.median(twins))
         larger = value > typical
         component = quantity = ""

@@ -62,8 +62,18 @@ class Fault(NamedTuple):
     scale: float
     """by which an amount is multiplied to be shown in that unit"""
     meaning: str
-    """a phrase, with the amount in place of {}"""
+    """a phrase, with the amount in place of {}, and pairs "late|early" for amounts above and below
+    0; of a phrase without a pair the amount keeps its sign"""
     remedy: str
+
+    def says(self, amount: float, spread: float) -> str:
+        """The phrase with an amount and its standard deviation."""
+        signed = amount if "|" not in self.meaning else abs(amount)
+        shown = f"{self.scale * signed:.3g} {self.unit} (twins ± {self.scale * spread:.2g})"
+        words = (
+            word.split("|")[amount < 0] if "|" in word else word for word in self.meaning.split()
+        )
+        return " ".join(words).format(shown)
 
 
 _FAULTS = (
@@ -72,7 +82,7 @@ _FAULTS = (
         1e-3,
         "s",
         1.0,
-        "measurements are stamped {} late",
+        "measurements are stamped {} late|early",
         "a delay: jaxslam fit --calibrate delay",
     ),
     Fault(
@@ -88,7 +98,7 @@ _FAULTS = (
         1e-3,
         "%",
         100.0,
-        "distances are measured {} too long, or travel is recorded that much too short",
+        "distances are measured {} too long|short, or travel is recorded that much too short|long",
         "a scale: jaxslam fit --calibrate range, or scale",
     ),
     Fault(
@@ -96,7 +106,7 @@ _FAULTS = (
         1e-3,
         "m",
         1.0,
-        "ranges are measured {} too long",
+        "ranges are measured {} too long|short",
         "an offset: jaxslam fit --calibrate range",
     ),
     Fault(
@@ -104,7 +114,7 @@ _FAULTS = (
         1e-3,
         "%",
         100.0,
-        "turns are recorded {} too large",
+        "turns are recorded {} too large|small",
         "the scale of the odometry: jaxslam fit --calibrate scale",
     ),
     Fault(
@@ -121,7 +131,7 @@ _SLIP = Fault(
     1e-3,
     "%",
     100.0,
-    "travel is recorded {} too long",
+    "travel is recorded {} too long|short",
     "slipping wheels, or a push, in that time: odometry noise that grows there",
 )
 

@@ -156,6 +156,27 @@ def test_the_count_of_a_tail_falls_by_one_at_each_value():
     assert (np.diff(fine) <= 0).all()
 
 
+def test_a_fault_below_0_is_said_by_its_own_words():
+    faults, _ = planted_faults.faults_of(twin(drawn_logs.drawn(drawn_logs.yard())))
+    by_name = {fault.name: fault for fault in faults}
+    for name, amount, text in (
+        ("delay", 0.05, "measurements are stamped 0.05 s (twins ± 0.01) late"),
+        ("delay", -0.05, "measurements are stamped 0.05 s (twins ± 0.01) early"),
+        (
+            "longer",
+            -0.02,
+            "distances are measured 2 % (twins ± 1) too short, or travel is recorded"
+            " that much too long",
+        ),
+        (
+            "bending",
+            -0.1,
+            "the odometry records a turn of -0.1 rad/m (twins ± 0.01) of travel that is none",
+        ),
+    ):
+        assert by_name[name].says(amount, 0.01) == text
+
+
 def test_the_amount_of_a_fault_is_that_of_weighted_least_squares():
     info, _, _ = made_up(rows=50)
     fused = info.status == Status.FUSED
