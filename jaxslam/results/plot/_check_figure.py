@@ -59,6 +59,9 @@ def check_figure(check: ModelCheck, *, title: str = "", width: float = PAGE) -> 
         axes.tick_params(labelsize=_SMALL, length=2, pad=1)
         axes.locator_params(axis="x", nbins=3)
         axes.set_yticks([])
+        # A label as -0.0025 fills a third of a panel: few, and 0 in place of 0.0000.
+        axes.locator_params(axis="x", nbins=2)
+        axes.xaxis.set_major_formatter("{x:.4g}")
         axes.grid(visible=False)
     for axes in panels[len(check.statistics) :]:
         axes.set_axis_off()
