@@ -15,6 +15,8 @@ its lines are counted, one for a statement, without imports:
 - GTSAM: `InvariantEKFPose2`, https://gtsam.org, without its reset, which carries the covariance to
   the corrected pose, as this package's charts do not; how far that leads apart is reported
 
+With dynamax also a gyroscope's bias is estimated, in the same world (`BiasedOdometry`).
+
 Times are of the processor, after compilation, in turns, the median; runs a second of this package
 and of dynamax are those of a batch of 100 by `jax.vmap`. A library that is not
 installed is left out: `pip install --group alternatives`, which is apart from `dev` because dynamax
@@ -25,6 +27,7 @@ import ast
 import inspect
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from importlib import import_module
 from importlib.metadata import version
@@ -205,6 +208,61 @@ def with_dynamax(world, log):
     return found.filtered_means[1:, :3], found.filtered_covariances[1:, :3, :3]
 
 
+def biased_with_jaxslam(world, log):
+    ekf = jaxslam.filters.Localization(
+        world.motion, world.sensor, world.landmarks, correction="joint"
+    )
+    estimate = jaxslam.run(ekf, log, world.pose, world.pose_cov, jax.random.key(0)).estimate
+    state = jnp.concatenate([estimate.pose, estimate.further[:, :1]], axis=1)
+    return state, estimate.further_cov[:, :1, :1]
+
+
+def biased_with_dynamax(world, log):
+    """State: the pose, the bias, and the noises of v and omega over one interval."""
+    from dynamax.nonlinear_gaussian_ssm import ParamsNLGSSM, extended_kalman_filter
+    from jax.scipy.linalg import block_diag
+
+    places, dt = log.scan.tag.shape[-1], log.control[0, 2]
+    landmarks, sigma = jnp.asarray(world.landmarks), jnp.asarray(world.motion.noise_cov.sigma)
+
+    def move(state, row):
+        x, y, heading, bias, v_noise, omega_noise = state
+        v, omega, dt = row[:3]
+        travel, turn = (v + v_noise) * dt, (omega + omega_noise - bias) * dt
+        # Along an arc; without a turn (row 0) straight ahead, as sin(t/2)/(t/2) is 1 there.
+        half = jnp.where(turn == 0, 1.0, turn / 2)
+        chord = travel * jnp.where(turn == 0, 1.0, jnp.sin(half) / half)
+        along = heading + turn / 2
+        moved = [x + chord * jnp.cos(along), y + chord * jnp.sin(along), heading + turn]
+        return jnp.stack([*moved, bias, 0.0, 0.0])
+
+    def observe(state, row):
+        tag, valid = row[3:].reshape(2, places)
+        c, s = jnp.cos(state[2]), jnp.sin(state[2])
+        offset = landmarks[tag.astype(int)] - state[None, :2]
+        z = offset @ jnp.array([[c, -s], [s, c]])
+        return jnp.where(valid[:, None] > 0, z, 0.0).ravel()
+
+    scan, noise = log.scan, jnp.diag(sigma[:2] ** 2) / dt
+    seen = jnp.where(scan.valid, scan.tag, 0)
+    rows = jnp.concatenate([log.control, seen, scan.valid], axis=1)
+    z = jnp.where(scan.valid[..., None], scan.z, 0.0).reshape(len(rows), -1)
+    # It begins with an update: a row without measurements goes before the first control.
+    rows = jnp.concatenate([jnp.zeros_like(rows[:1]), rows])
+    z = jnp.concatenate([jnp.zeros_like(z[:1]), z])
+    walk = sigma[2:3, None] ** 2 * dt
+    params = ParamsNLGSSM(
+        initial_mean=jnp.concatenate([jnp.asarray(world.pose[:4], z.dtype), jnp.zeros(2)]),
+        initial_covariance=block_diag(jnp.asarray(world.pose_cov)[:4, :4], noise),
+        dynamics_function=move,
+        dynamics_covariance=block_diag(jnp.zeros((3, 3)), walk, noise),
+        emission_function=observe,
+        emission_covariance=jnp.kron(jnp.eye(places), world.sensor.noise_cov.cov),
+    )
+    found = extended_kalman_filter(params, z, rows)
+    return found.filtered_means[1:, :4], found.filtered_covariances[1:, 3:4, 3:4]
+
+
 def with_gtsam(world, log, reset=False):
     import gtsam
     from scipy.linalg import block_diag
@@ -246,6 +304,20 @@ COMPILED = {"jaxslam": with_jaxslam, "dynamax": with_dynamax}
 def task(steps: int):
     """A world and a log as NumPy arrays."""
     world = jaxslam.scenarios.circle(steps=steps)
+    _, log = jaxslam.simulate(world, jax.random.key(0))
+    return world, jax.tree.map(np.asarray, log)
+
+
+def biased_task(steps: int):
+    """The same world by odometry whose gyroscope has a bias that wanders, and a log."""
+    density = np.array([0.05, 0.02, 0.005, 0.0])
+    world = replace(
+        jaxslam.scenarios.circle(steps=steps),
+        motion=jaxslam.motion.BiasedOdometry(jaxslam.motion.NoiseDensity(density)),
+        noise_on="robot",
+        pose=np.array([0.0, 0.0, 0.0, 0.0, 1.0]),
+        pose_cov=np.diag([0.0, 0.0, 0.0, 0.05, 0.0]) ** 2,
+    )
     _, log = jaxslam.simulate(world, jax.random.key(0))
     return world, jax.tree.map(np.asarray, log)
 
@@ -298,6 +370,15 @@ def measure(quick: bool = False) -> list[Metric]:
         metrics += [
             Metric(f"{name}: greatest difference of a pose [m, rad]", off, high=1e-6),
             Metric(f"{name}: of a covariance, over its greatest entry", spread, high=1e-4),
+        ]
+    if "dynamax" in there:
+        biased, its_log = biased_task(500)
+        off, spread = difference(
+            biased_with_dynamax(biased, its_log), biased_with_jaxslam(biased, its_log)
+        )
+        metrics += [
+            Metric("dynamax, a gyroscope's bias in the state: greatest difference", off, high=1e-6),
+            Metric("dynamax: of its variance, over the variance", spread, high=1e-6),
         ]
     if "GTSAM" in there:
         off, _ = difference(with_gtsam(world, log, reset=True), left_invariant(world, log))

@@ -10,6 +10,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
+from jaxslam.core._table import Row, Table, markdown_of, text_of
 from jaxslam.results.plot._style import png
 
 FIGURES = Path(__file__).parent / "figures"
@@ -37,11 +38,13 @@ class Metric:
 
 def report(metrics: list[Metric]) -> int:
     """Print the metrics with their gates; the exit status, 1 if any gate is missed."""
-    width = max(len(m.name) for m in metrics)
+    rows = []
     for m in metrics:
         gate = "" if m.low == -m.high == float("-inf") else f"[{m.low:.4g}, {m.high:.4g}]"
-        verdict = "ok" if m.passes else "MISSED"
-        print(f"{m.name:{width}}  {m.value:>10.4g}  {gate:>20}  {verdict:6}  {m.note}")
+        rows.append(
+            Row(m.name, [f"{m.value:.4g}", gate, "ok" if m.passes else "MISSED"], note=m.note)
+        )
+    print(text_of(Table((), rows)))
     missed = [m.name for m in metrics if not m.passes]
     print(f"{len(metrics) - len(missed)} of {len(metrics)} gates met")
     return 1 if missed else 0
@@ -49,22 +52,18 @@ def report(metrics: list[Metric]) -> int:
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """A Markdown table."""
-    lines = ["| " + " | ".join(row) + " |" for row in (header, *rows)]
-    return "\n".join([lines[0], "|" + "---|" * len(header), *lines[1:]])
+    return markdown_of(Table(header, [Row(name, cells) for name, *cells in rows]))
 
 
 def show(title: str, rows: Mapping[Any, Mapping[str, float | str]]) -> None:
     """Print a table of {row: {column: value}}."""
     columns = list(dict.fromkeys(column for row in rows.values() for column in row))
-    cells = [["", *columns]]
+    lines = []
     for name, row in rows.items():
-        values = (row.get(column, "-") for column in columns)
-        cells.append([str(name), *(v if isinstance(v, str) else f"{v:.4g}" for v in values)])
-    first, *widths = (max(map(len, column)) for column in zip(*cells, strict=True))
-    print(f"\n{title}")
-    for name, *row in cells:
-        aligned = (f"  {cell:>{width}}" for cell, width in zip(row, widths, strict=True))
-        print(f"{name:{first}}" + "".join(aligned), flush=True)
+        values = (row.get(column) for column in columns)
+        cells = [v if v is None or isinstance(v, str) else f"{v:.4g}" for v in values]
+        lines.append(Row(str(name), cells))
+    print(f"\n{title}\n{text_of(Table(['', *columns], lines))}", flush=True)
 
 
 def child(*arguments: object) -> Any:

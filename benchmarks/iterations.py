@@ -20,7 +20,7 @@ import jax
 import numpy as np
 
 from benchmarks.bearing import worlds as bearing_worlds
-from benchmarks.gate import Metric
+from benchmarks.gate import Metric, show
 from jaxslam import Scenario, monte_carlo, sensors
 from jaxslam.catalog import FILTERS
 from jaxslam.core.protocols import Filter
@@ -51,20 +51,20 @@ def cases() -> Iterator[tuple[str, Scenario, Callable[..., Filter]]]:
 
 def measure(quick: bool = False) -> list[Metric]:
     runs, metrics, rmse = 20 if quick else 100, [], {}
-    print(f"{'':32}{'iterations':>10}{'pose NEES':>11}{'position RMSE [m]':>19}  verdict")
     for name, world, make in cases():
+        rows = {}
         filters = {str(n): make(iterations=n) for n in ITERATIONS}
         campaign = monte_carlo(world, filters, runs, jax.random.key(0), progress=False, bound=False)
         for n, summary in campaign.filters.items():
             nees, rmse[name, n] = (
                 summary.measures[measure].value for measure in ("nees_pose", "rmse_position")
             )
-            print(
-                f"{name:32}{n:>10}{nees:11.3f}{rmse[name, n]:19.4f}  {summary.verdict}", flush=True
-            )
+            rows[n] = {"pose NEES": nees, "position RMSE [m]": rmse[name, n]}
+            rows[n] |= {"verdict": summary.verdict}
             what = f"{name}, {n} iteration{'s' * (n != '1')}"
             metrics.append(Metric(f"{what}: pose NEES", nees))
             metrics.append(Metric(f"{what}: position RMSE [m]", rmse[name, n]))
+        show(f"{name}, by the number of iterations", rows)
     ratio = rmse[KNOWN_MAP, "10"] / rmse[KNOWN_MAP, "1"]
     metrics.append(Metric(f"{KNOWN_MAP}: RMSE of 10 iterations / 1", ratio, high=1.0))
     return metrics

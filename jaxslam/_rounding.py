@@ -6,8 +6,9 @@ result as soon as it is not far below the noise R: of a start with σ = 30 m and
 5 cm, float32 leaves one of its seven digits. Coordinates are rounded by eps |x|.
 """
 
+import dataclasses
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -40,6 +41,8 @@ class Rounding(NamedTuple):
     doubt is another"""
     square_root: bool
     """whether the filter holds a root of P, which is rounded by eps √V"""
+    may_be_root: bool
+    """whether it could, by its option `covariance`"""
     first_order: bool
     """whether it is a method of this package that linearizes by Jacobians"""
 
@@ -84,7 +87,7 @@ class Rounding(NamedTuple):
     def remedy(self) -> str:
         """Advice against the rounding."""
         advice = "set jax_enable_x64" if self.dtype == np.float32 else "begin with less variance"
-        if self.square_root:
+        if self.square_root or not self.may_be_root:
             return advice
         return (
             f'{advice}, or give the filter covariance="square_root", which keeps twice the digits'
@@ -126,8 +129,18 @@ def rounding_of(
         reach=reach,
         least=least,
         square_root=bool(getattr(method, "square_root", False)),
+        may_be_root=_may_be_root(method),
         first_order=by_jacobians and type(method).__module__.partition(".")[0] == "jaxslam",
     )
+
+
+def _may_be_root(method: object) -> bool:
+    """Whether a filter has an option by which it holds a root of P."""
+    try:
+        changed: Any = dataclasses.replace(method, covariance="square_root")  # type: ignore[type-var]
+    except (TypeError, ValueError):  # it has no such option, or refuses this one
+        return False
+    return bool(changed.square_root)
 
 
 class _HostTrace(NamedTuple):

@@ -53,7 +53,7 @@ def measure():
     ekf = EkfSlam(cloister().motion, sensor, COUNT)
 
     def correct(joint, scan):
-        return correct_in_turn(ekf, sensor, joint, scan.z, scan.tag, scan.valid)[0]
+        return correct_in_turn(ekf, sensor, joint, scan.z, scan.tag, scan.valid, None)[0]
 
     def find(method):
         return lambda joint, scan: tuple(method(prediction_of(ekf, sensor, joint), scan))

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from benchmarks.gate import FIGURES, Metric
+from benchmarks.gate import FIGURES, Metric, show
 from benchmarks.real_data import DATA
 from jaxslam import datasets, laser_slam, metrics
 from jaxslam.laser.laser_slam import LoopOutcome
@@ -97,15 +97,16 @@ def measure(quick: bool = False) -> list[Metric]:
 
 def by_file(name: str, log: datasets.LaserLog, solved: laser_slam.Solved) -> list[Metric]:
     """Errors to the poses in the file, and loops that agree with them."""
-    means = {}
-    print("path             relation error [m]  heading [deg]   of 1 m   2 m    5 m   10 m")
+    means, rows = {}, {}
     for what, path in paths(solved).items():
         errors = [metrics.rpe(log.corrected, path, metres=m) for m in METRES]
         every = np.concatenate([each.translation for each in errors])
         turn = np.degrees(np.concatenate([each.rotation for each in errors]).mean())
         means[what] = every.mean()
-        each = "  ".join(f"{one.translation.mean():5.3f}" for one in errors)
-        print(f"{what:15}  {every.mean():18.4f}  {turn:13.2f}   {each}", flush=True)
+        rows[what] = {"relation error [m]": f"{every.mean():.4f}", "heading [deg]": f"{turn:.2f}"}
+        for m, of_length in zip(METRES, errors, strict=True):
+            rows[what][f"of {m:g} m"] = f"{of_length.translation.mean():.3f}"
+    show(f"{name}, errors to the poses in the file", rows)
     ate = metrics.ate(log.corrected, solved.poses).translation
     score = laser_slam.closure_score(solved, log.corrected)
     high = LOGS[name].high if LOGS[name].relations is None else np.inf
@@ -127,15 +128,15 @@ def by_relations(name: str, log: datasets.LaserLog, solved: laser_slam.Solved) -
     )
     far = np.abs(log.time[of.first] - log.time[of.second]) > LONG
     inside = laser_slam.relation_nees(solved, *of) <= chi2_quantile(0.95, 3)
-    print(f"{len(of.pose)} relations of {len(of.pose) + lost} join, {far.sum()} over {LONG:g} s")
-    print("path             relations     translation [m]       squared [m²]      rotation [deg]")
-    found = []
+    found, table = [], {}
     for what, path in paths(solved).items():
         errors = metrics.relation_errors(of, path)
         for which, rows in (("all", np.ones(len(far), bool)), (f"over {LONG:g} s", far)):
             t, r = errors.translation[rows], np.degrees(errors.rotation[rows])
-            cells = (f"{x.mean():.4f} ± {x.std():.4f}" for x in (t, t**2, r))
-            print(f"{what:15}  {which:9}  " + "  ".join(f"{cell:>18}" for cell in cells))
+            columns = {"translation [m]": t, "squared [m²]": t**2, "rotation [deg]": r}
+            table[f"{what}, {which}"] = {
+                head: f"{x.mean():.4f} ± {x.std():.4f}" for head, x in columns.items()
+            }
             if what != "laser SLAM":
                 continue
             of_name, high = f"{name}, {which} relations", LOGS[name].high
@@ -146,6 +147,9 @@ def by_relations(name: str, log: datasets.LaserLog, solved: laser_slam.Solved) -
                 Metric(f"{of_name} [deg]", r.mean(), note=f"± {r.std():.3f}"),
                 Metric(f"{of_name} in the 95 % ellipse", inside[rows].mean(), note=apart),
             ]
+    count = len(of.pose)
+    title = f"{name}: {count} relations of {count + lost} join, {far.sum()} over {LONG:g} s"
+    show(title, table)
     return found
 
 

@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxslam
-from benchmarks.gate import Metric, save
+from benchmarks.gate import Metric, save, table
 from benchmarks.mrclam import fit as fitting
 from benchmarks.mrclam import replays
 from benchmarks.mrclam.figure import errors_and_nees
@@ -83,7 +83,7 @@ class Scored(NamedTuple):
         cells = [robot, filter, noise, f"{self.ate:.3f}", f"{self.aligned:.3f}", f"{heading:.1f}"]
         cells += [f"{claimed:.3f}", f"{np.median(self.nees):.2f}", f"{self.nees.mean():.2f}"]
         cells += [f"{self.nis:.2f}", self.rejected, f"{self.unseen:.0f}"]
-        return "| " + " | ".join(map(str, cells)) + " |"
+        return list(map(str, cells))
 
 
 def scored(time, true, known, pose, cov, info, own, seen):
@@ -121,7 +121,7 @@ def constants_row(robot, source, constants, sigma):
     cells = [f"{value:.4f}" for value in values]
     if sigma is not None:
         cells = [f"{cell} ± {s:.4f}" for cell, s in zip(cells, sigma, strict=True)]
-    return f"| {robot} | {source} | " + " | ".join(cells) + f" | {constants.depth:.4f} |"
+    return [str(robot), source, *cells, f"{constants.depth:.4f}"]
 
 
 def ekf(data, row, chart):
@@ -235,13 +235,14 @@ def measure(quick: bool = False) -> list[Metric]:
         return []
     own = {robot: own_log(folder, robot) for robot in ROBOTS}
     true = {robot: fitting.fit(folder, robot, turned=True) for robot in ROBOTS}
-    print("\n| robot | source | " + " | ".join(FITTED) + " | depth |\n|" + " --- |" * 10)
+    rows = []
     for robot, each in own.items():
-        print(constants_row(robot, "own log", each.robot, sigma_of(each)))
-        print(constants_row(robot, "own truth", true[robot], None), flush=True)
+        rows.append(constants_row(robot, "own log", each.robot, sigma_of(each)))
+        rows.append(constants_row(robot, "own truth", true[robot], None))
+    print("\n" + table(["robot", "source", *FITTED, "depth"], rows))
     scale = float(np.std([each.robot.forward for each in own.values()], ddof=1))
     print(f"\nscale: standard deviation {scale:.4f}, that of `forward` over the own logs")
-    print("\n| " + " | ".join(COLUMNS) + " |\n|" + " --- |" * len(COLUMNS))
+    rows = []
     kinds = {"EKF": charts.Euclidean(), "invariant EKF": charts.RightInvariant()}
     estimators = {
         "invariant EKF": partial(ekf, chart=kinds["invariant EKF"]),
@@ -253,16 +254,17 @@ def measure(quick: bool = False) -> list[Metric]:
         for noise, calibration in zip(NOISES, each, strict=True):
             for name, chart in kinds.items():
                 path = run_alone(folder, robot, calibration, chart)
-                print(path.row(robot, name, noise), flush=True)
+                rows.append(path.row(robot, name, noise))
         for name, estimator in estimators.items():
             plain, path = own_constants(folder, robot, own[robot], scale, estimator)
             if name == "smoother":
-                print(plain.row(robot, name, "own log"))
+                rows.append(plain.row(robot, name, "own log"))
             considered[name][robot] = path
-            print(path.row(robot, name, CONSIDERED), flush=True)
+            rows.append(path.row(robot, name, CONSIDERED))
     for name, sightings in (("team EKF, no sightings", False), ("team EKF, sightings", True)):
         for robot, path in run_team(folder, sightings, {r: own[r].robot for r in TEAM}):
-            print(path.row(robot, name, "own log"), flush=True)
+            rows.append(path.row(robot, name, "own log"))
+    print("\n" + table(COLUMNS, rows), flush=True)
     simulated = replays.table(folder, ROBOTS, ASKED)
     for name, held in (("invariant EKF", HELD), ("smoother", dict.fromkeys(HELD, ASKED))):
         for robot, (ate, nees) in held.items():

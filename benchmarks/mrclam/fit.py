@@ -6,10 +6,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import least_squares
 
-from benchmarks.gate import Metric
+from benchmarks.gate import Metric, table
 from benchmarks.real_data import DATA
 from jaxslam.core.logs._streams import interpolate_poses
 from jaxslam.datasets import MRCLAM_CALIBRATION, RobotCalibration
+from jaxslam.datasets._account import Account
 from jaxslam.datasets._landmark_logs.mrclam_robot import read_landmarks, read_robot, read_truth
 
 RATE = 50.0
@@ -29,7 +30,7 @@ TOLERANCE = 0.05, 0.01
 def camera(folder: Path, robot: int, turned: bool) -> tuple[np.ndarray, float, np.ndarray]:
     """(depth, ahead, yaw, axis), the time from a measurement to the truth, and the residuals'
     deviations. Unless turned, yaw and axis are zero. Misread barcodes are left out."""
-    subject_of, names, points, _ = read_landmarks(folder, errata=True)
+    subject_of, names, points = read_landmarks(folder, True, Account())
     truth, (_, seen) = read_truth(folder, robot), read_robot(folder, robot)
     index = [names.index(s) if (s := subject_of.get(int(b))) in names else -1 for b in seen[:, 1]]
     which = np.array(index)
@@ -150,10 +151,10 @@ def measure(quick: bool = False) -> list[Metric]:
     if not folder.is_dir():
         print(f"no folder {folder}")
         return []
-    print("| robot 1 of data set 6 | fitted | package |\n| --- | --- | --- |")
-    fields = RobotCalibration._fields
+    rows, fields = [], RobotCalibration._fields
     for name, new, kept in zip(fields, fit(folder), MRCLAM_CALIBRATION, strict=True):
-        print(f"| {name} | {new:.4f} | {kept:.4f} |")
+        rows.append([name, f"{new:.4f}", f"{kept:.4f}"])
         relative, absolute = TOLERANCE
         worst = max(worst, abs(new - kept) / max(relative * abs(kept), relative * absolute))
+    print(table(["robot 1 of data set 6", "fitted", "package"], rows))
     return [Metric("constants off the fit, share of the tolerance", worst, high=1.0)]

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxslam
+from benchmarks import gate
 from benchmarks.mrclam import fit as fitting
 from jaxslam import charts, datasets, linearize
 from jaxslam.consistency import block_nees, pose_error
@@ -143,19 +144,21 @@ def replay(folder: Path, robot: int) -> Replayed:
 
 def table(folder: Path, robots: range, asked: tuple[float, float]) -> dict[int, Replayed]:
     """Prints noise of the heading by window, and what simulated runs come to."""
-    print("\n| robot | " + " | ".join(f"{w:g} s" for w in fitting.WINDOWS) + " |")
-    print("|" + " --- |" * (1 + len(fitting.WINDOWS)))
-    for robot in robots:
-        heading = fitting.odometry(folder, robot).heading
-        print(f"| {robot} | " + " | ".join(f"{each:.4f}" for each in heading) + " |", flush=True)
-    print(f"\n| robot | bound [m] | ATE 5, 50, 95 % [m] | ATE at most {asked[0]} | ", end="")
-    print(f"NEES 5, 50, 95 % | NEES at most {asked[1]:g} |\n|" + " --- |" * 6)
-    found = {}
+    headings = [
+        [f"{robot}", *(f"{sigma:.4f}" for sigma in fitting.odometry(folder, robot).heading)]
+        for robot in robots
+    ]
+    windows = [f"{seconds:g} s" for seconds in fitting.WINDOWS]
+    print("\n" + gate.table(["robot", *windows], headings), flush=True)
+    found, rows = {}, []
     for robot in robots:
         found[robot] = one = replay(folder, robot)
         ate, nees = (np.quantile(values, [0.05, 0.5, 0.95]) for values in (one.ate, one.nees))
         cells = [f"{robot}", f"{one.bound:.3f}", ", ".join(f"{x:.3f}" for x in ate)]
         cells += [f"{(one.ate <= asked[0]).mean():.3f}", ", ".join(f"{x:.2f}" for x in nees)]
         cells += [f"{(one.nees <= asked[1]).mean():.3f}"]
-        print("| " + " | ".join(cells) + " |", flush=True)
+        rows.append(cells)
+    heads = ["robot", "bound [m]", "ATE 5, 50, 95 % [m]", f"ATE at most {asked[0]}"]
+    heads += ["NEES 5, 50, 95 %", f"NEES at most {asked[1]:g}"]
+    print("\n" + gate.table(heads, rows), flush=True)
     return found

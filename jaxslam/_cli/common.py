@@ -18,6 +18,7 @@ from jaxslam.consistency.campaign._pieces import cores
 from jaxslam.consistency.campaign._progress import Progress
 from jaxslam.core._names import closest_name
 from jaxslam.core._optional import loading
+from jaxslam.core._table import Row, Table, text_of
 from jaxslam.results._campaign_files import FORMATS, RESULT
 from jaxslam.results._files import Files, check_writable, write_files
 from jaxslam.verify._user_errors import describe_error
@@ -155,20 +156,13 @@ def add_figures(parser: argparse.ArgumentParser, formats: Collection[str], note:
 
 def summary_table(columns: Mapping[str, Mapping[str, object]]) -> str:
     """Summaries side by side, one row per entry; several have their names above them."""
-    rows = list(dict.fromkeys(key for column in columns.values() for key in column))
-    lines = [["", *columns]] if len(columns) > 1 else []
-    for row in rows:
-        missing = 0 if row.startswith(COUNT) else "-"
-        lines.append([row, *(_cell_text(column.get(row, missing)) for column in columns.values())])
-    # The last column is not padded.
-    widths = [max(len(line[i]) for line in lines) for i in range(len(columns))]
-    indent = "\n" + " " * (widths[0] + 2)  # of a cell of several lines
-    return "\n".join(
-        "  ".join(
-            [*(cell.ljust(w) for cell, w in zip(line, widths, strict=False)), line[-1]]
-        ).replace("\n", indent)
-        for line in lines
-    )
+    rows = []
+    for key in dict.fromkeys(key for column in columns.values() for key in column):
+        missing = 0 if key.startswith(COUNT) else "-"
+        cells = [_cell_text(column.get(key, missing)) for column in columns.values()]
+        rows.append(Row(key, cells))
+    heads = ["", *columns] if len(columns) > 1 else []
+    return text_of(Table(heads, rows), align="<")
 
 
 def _cell_text(value: object) -> str:

@@ -5,8 +5,10 @@ import argparse
 import re
 import shutil
 import sys
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -17,16 +19,19 @@ from jaxslam._cli.common import FAILED, add_figures, add_out, check_out, chosen_
 from jaxslam._cli.recorded import judge_recording
 from jaxslam._cli.user_objects import UserObjects
 from jaxslam.consistency._verdict import is_faulty
+from jaxslam.consistency.campaign import Campaign
 from jaxslam.consistency.campaign._judging import judge_sources
 from jaxslam.consistency.campaign._pieces import cores
 from jaxslam.consistency.campaign._run_estimates import RunFault
 from jaxslam.core._names import closest_name
+from jaxslam.core.protocols import Candidate
 from jaxslam.core.validation import at_least, or_none, positive, require
 from jaxslam.datasets._judged_folders import DrawsFolder, folder_source, read_draws, run_name
 from jaxslam.results import _campaign_files as campaign_files
 from jaxslam.results import store
 from jaxslam.results._block_files import MANIFEST
 from jaxslam.results._campaign_files import BLOCKS, FORMATS, JUDGED
+from jaxslam.simulation._worlds import World
 
 FOLDER = "estimates"
 """Default folder of the estimates that the command computes."""
@@ -114,6 +119,20 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(command=run_judge)
 
 
+class JudgePlan(NamedTuple):
+    """What `jaxslam judge` judges: folders of estimates, and filters, on a folder of draws."""
+
+    draws: DrawsFolder
+    folders: dict[str, Path]
+    """by name, which are the columns of the table"""
+    world: World
+    filters: Mapping[str, Candidate]
+    runs: int
+    devices: list[jax.Device]
+    figures: tuple[str, ...]
+    """formats of the figures"""
+
+
 def run_judge(options: argparse.Namespace, command: str) -> int:
     """Judge estimates or a recording, print the table and write its files; the exit status.
 
@@ -126,12 +145,33 @@ def run_judge(options: argparse.Namespace, command: str) -> int:
         if getattr(options, field) != default:
             beside = "beside" if is_recording else "without"
             raise ValueError(f"{label}: expected none {beside} --estimate and --truth")
-    return (judge_recording.run if is_recording else _judge_estimates)(options, command)
+    if is_recording:
+        return judge_recording.run(options, command)
 
-
-def _judge_estimates(options: argparse.Namespace, command: str) -> int:
-    """Judge folders of estimates of a folder of draws."""
     jax.config.update("jax_enable_x64", True)
+    user = UserObjects()
+    plan = plan_of(options, user)
+    campaign, columns = judge_folders(plan, options, user)
+    print(campaign)
+    # The numbers first: what an interrupted command leaves has no runs of another campaign.
+    blocks = options.out / BLOCKS
+    shutil.rmtree(blocks, ignore_errors=True)
+    failed: list[str] = []
+    paths = campaign_files.save_campaign(
+        campaign, options.out, plan.figures, True, command, None, failed.append
+    )
+    kept = store.open(blocks, JUDGED, campaign.runs)
+    kept.claim({"filters": ", ".join(campaign.filters), "steps": str(campaign.steps)})
+    kept.save(0, columns, campaign.runs)
+    print("\nwrote " + ", ".join(map(str, paths)))
+    for sentence in failed:
+        print(f"jaxslam: {sentence}", file=sys.stderr)
+    is_wrong = any(is_faulty(summary.counts) for summary in campaign.filters.values())
+    return FAILED if is_wrong or failed else 0
+
+
+def plan_of(options: argparse.Namespace, user: UserObjects) -> JudgePlan:
+    """The checked options, with the draws, the world and the filters that they name."""
     formats = require("--figures", options.figures.split(","), campaign_files.formats_of_figures)
     if not options.estimates and options.estimator is not None:
         options.estimates = [FOLDER]
@@ -139,19 +179,21 @@ def _judge_estimates(options: argparse.Namespace, command: str) -> int:
         raise ValueError("ESTIMATES: expected a folder of estimates, got none")
     if options.draws is None:
         raise ValueError("--draws: expected the folder of `jaxslam draws`, got none")
-    folders = _name_folders([Path(folder) for folder in options.estimates])
+    folders: dict[str, Path] = {}
+    for folder in map(Path, options.estimates):
+        name = folder.resolve().name
+        if name in folders:
+            raise ValueError(
+                f"ESTIMATES: expected folders of different names, got {folders[name]} and {folder}"
+            )
+        folders[name] = folder
     draws = read_draws(Path(options.draws))
     runs = draws.runs if options.runs is None else options.runs
-    for name, count in (
-        ("runs", options.runs),
-        ("every", options.stride),
-        ("processes", options.processes),
-    ):
-        require(f"--{name}", count, or_none(at_least(1)))
+    for name, field in (("runs", "runs"), ("every", "stride"), ("processes", "processes")):
+        require(f"--{name}", getattr(options, field), or_none(at_least(1)))
     if runs > draws.runs:
         raise ValueError(f"--runs: expected at most {draws.runs}, as {options.draws} has")
     require("--time-limit", options.time_limit, or_none(positive))
-    user = UserObjects()
     world = user.scenario(draws.scenario, draws.steps)
     if world.steps % options.stride:
         raise ValueError(
@@ -177,76 +219,54 @@ def _judge_estimates(options: argparse.Namespace, command: str) -> int:
     blocks = options.out / BLOCKS
     if (blocks / MANIFEST).exists() and store.resume(blocks).settings != JUDGED:
         raise ValueError(f"--out: {options.out} holds a campaign: choose another folder")
+    if options.estimator is not None and len(folders) > 1:
+        raise ValueError(f"--estimator: expected one folder of estimates, got {len(folders)}")
+    return JudgePlan(draws, folders, world, filters, runs, devices, formats)
+
+
+def judge_folders(
+    plan: JudgePlan, options: argparse.Namespace, user: UserObjects
+) -> tuple[Campaign, dict[str, np.ndarray]]:
+    """The campaign of the estimates in all folders, and its numbers by run for a store.
+
+    The estimates are computed first if the user has a program for that.
+    """
+    draws = plan.draws
     columns: dict[str, np.ndarray] = {}
     failures: dict[int, RunFault] = {}
     if options.estimator is not None:
-        if len(folders) > 1:
-            raise ValueError(f"--estimator: expected one folder of estimates, got {len(folders)}")
-        (folder,) = folders.values()
+        (folder,) = plan.folders.values()
         program = Programs(options.estimator, draws, folder, options.time_limit)
-        failures = program.run(range(runs), options.processes or cores())
-    for folder in folders.values():
-        _check_folder(folder, draws, bool(failures))
+        failures = program.run(range(plan.runs), options.processes or cores())
+    names = {run_name(number) for number in range(draws.runs)}
+    for folder in plan.folders.values():
+        content = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
+        if further := sorted(n for n in content - names if re.fullmatch(r"\d{4,}", n, re.ASCII)):
+            raise ValueError(
+                f"{folder / further[0]}: {draws.path} has runs {run_name(0)} to "
+                f"{run_name(draws.runs - 1)} alone"
+            )
+        if not content & names and not failures:
+            problem = "holds no estimate" if folder.is_dir() else "is no folder"
+            raise ValueError(
+                f"{folder} {problem}: expected {run_name(0)}/trajectory.csv, and so on, for each "
+                f"run of {draws.path}"
+            )
+    measured, state = plan.world.sensor.measurements, plan.world.motion.state
+    sources = {
+        name: folder_source(folder, draws, measured, options.stride, failures, state)
+        for name, folder in plan.folders.items()
+    }
     with user.located_errors():
         campaign = judge_sources(
-            world,
-            {
-                name: folder_source(
-                    folder, draws, world.sensor.measurements, options.stride, failures
-                )
-                for name, folder in folders.items()
-            },
-            runs,
+            plan.world,
+            sources,
+            plan.runs,
             draws.key,
-            filters=filters,
+            filters=plan.filters,
             stride=options.stride,
             bound=options.bound,
-            devices=devices,
+            devices=plan.devices,
             save=columns.update,
         )
-    campaign = replace(campaign, reference=options.compare or "")
-    print(campaign)
-    # The numbers first: what an interrupted command leaves has no runs of another campaign.
-    shutil.rmtree(blocks, ignore_errors=True)
-    failed: list[str] = []
-    paths = campaign_files.save_campaign(
-        campaign, options.out, formats, True, command, None, failed.append
-    )
-    kept = store.open(blocks, JUDGED, campaign.runs)
-    kept.claim({"filters": ", ".join(campaign.filters), "steps": str(campaign.steps)})
-    kept.save(0, columns, campaign.runs)
-    print("\nwrote " + ", ".join(map(str, paths)))
-    for sentence in failed:
-        print(f"jaxslam: {sentence}", file=sys.stderr)
-    is_wrong = any(is_faulty(summary.counts) for summary in campaign.filters.values())
-    return FAILED if is_wrong or failed else 0
-
-
-def _name_folders(folders: list[Path]) -> dict[str, Path]:
-    """Folders by their names, which name the columns of the table."""
-    named: dict[str, Path] = {}
-    for folder in folders:
-        name = folder.resolve().name
-        if name in named:
-            raise ValueError(
-                f"ESTIMATES: expected folders of different names, got {named[name]} and {folder}"
-            )
-        named[name] = folder
-    return named
-
-
-def _check_folder(folder: Path, draws: DrawsFolder, may_be_empty: bool) -> None:
-    """Raise ValueError on a folder without the estimate of a run, and on runs without draws."""
-    names = {run_name(number) for number in range(draws.runs)}
-    content = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
-    if further := sorted(n for n in content - names if re.fullmatch(r"\d{4,}", n, re.ASCII)):
-        raise ValueError(
-            f"{folder / further[0]}: {draws.path} has runs {run_name(0)} to "
-            f"{run_name(draws.runs - 1)} alone"
-        )
-    if not content & names and not may_be_empty:
-        problem = "holds no estimate" if folder.is_dir() else "is no folder"
-        raise ValueError(
-            f"{folder} {problem}: expected {run_name(0)}/trajectory.csv, and so on, for each run "
-            f"of {draws.path}"
-        )
+    return replace(campaign, reference=options.compare or ""), columns

@@ -28,6 +28,7 @@ from jaxslam._cli.common import (
     write_results,
 )
 from jaxslam.consistency.campaign._progress import Progress
+from jaxslam.core._table import csv_text
 from jaxslam.core.types import JaxOrNumPy
 from jaxslam.core.validation import InvalidField, at_least, refusals_of, require
 from jaxslam.datasets import _g2o as g2o
@@ -37,7 +38,7 @@ from jaxslam.graphs._factor import Factor
 from jaxslam.graphs._graph import TRUSTED
 from jaxslam.graphs._solver.kernels import REGISTRY as KERNELS
 from jaxslam.graphs.starts import STARTS
-from jaxslam.results._files import Files, Json, csv_text, json_number, json_text, versions
+from jaxslam.results._files import Files, Json, json_number, json_text, versions
 
 ERRORS = {
     "pose": (graphs.RelativePose(), "e = Z⁻¹ ∘ (Xᵢ⁻¹ ∘ Xⱼ) as (x, y, θ)"),

@@ -3,7 +3,6 @@
 import argparse
 import os
 import time
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
@@ -26,7 +25,23 @@ def verify_models(options: argparse.Namespace, command: str) -> int:
     check_writable(options.out)
     verify_one = partial(verify.verify_jacobians, count=options.states, seed=options.seed)
     if options.target is None:
-        reports = _verify_all(verify_one)
+        models = motion.REGISTRY | sensors.REGISTRY | beam_models.REGISTRY
+        reports = []
+        with (
+            Progress(f"{len(models)} models", "models") as progress,
+            ThreadPoolExecutor(os.cpu_count()) as pool,  # compilation takes most of the time
+        ):
+            tasks = [
+                pool.submit(lambda make: verify_one(build(make)), factory)
+                for factory in models.values()
+            ]
+            try:
+                for task in tasks:
+                    reports.append(task.result())
+                    progress(len(reports), len(models))
+            except BaseException:  # on an interrupt, models not yet started are dropped
+                pool.shutdown(wait=False, cancel_futures=True)
+                raise
         print(report_table(reports))
     else:
         reports = user_files.verify_file(options.target, verify_one)
@@ -43,28 +58,6 @@ def verify_models(options: argparse.Namespace, command: str) -> int:
     written = write_files(options.out, {"verify.json": json_text(content)})
     print(f"{content['seconds']:.1f} s; wrote {written[0]}")
     return 0 if passed else FAILED
-
-
-def _verify_all(verify_one: Callable[..., verify.Report]) -> list[verify.Report]:
-    """A report on every registered model, several at a time."""
-    models = motion.REGISTRY | sensors.REGISTRY | beam_models.REGISTRY
-    reports = []
-    with (
-        Progress(f"{len(models)} models", "models") as progress,
-        ThreadPoolExecutor(os.cpu_count()) as pool,  # compilation takes most of the time
-    ):
-        tasks = [
-            pool.submit(lambda make: verify_one(build(make)), factory)
-            for factory in models.values()
-        ]
-        try:
-            for task in tasks:
-                reports.append(task.result())
-                progress(len(reports), len(models))
-        except BaseException:  # on an interrupt, models not yet started are dropped
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
-    return reports
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

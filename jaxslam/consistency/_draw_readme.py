@@ -17,10 +17,17 @@ from jaxslam.consistency._draw_tables import (
     unsaid_options,
     unsaid_settings,
 )
-from jaxslam.core.logs._tables import INTERVAL, TAG, TIME, measurement_columns, split_unit
+from jaxslam.core.logs._tables import (
+    INTERVAL,
+    TAG,
+    TIME,
+    label,
+    measurement_columns,
+    split_unit,
+)
 from jaxslam.core.noise import Constant
 from jaxslam.core.protocols import Model, Motion, Sensor
-from jaxslam.motion import Substeps
+from jaxslam.motion import Augmented, NoiseDensity, Substeps
 from jaxslam.sensors._suite import Wrapped
 from jaxslam.simulation._scans import BetweenRanges
 from jaxslam.simulation._worlds import World
@@ -30,6 +37,15 @@ y_s = y + mount_x*sin(theta) + mount_y*cos(theta)
 theta_s = wrap(theta + mount_theta)"""
 
 _NO_MOUNT = "x_s, y_s, theta_s = x, y, theta    # the sensor is at the robot's pose"
+
+_JUDGING = """The judge is a command of the Python package `jaxslam`. It compares the errors \
+with the covariances (NEES, intervals, a verdict), beside filters of the package on the same runs, \
+and can run your program itself:
+
+```console
+$ jaxslam judge estimates --draws draws --filters ekf --out out
+$ jaxslam judge estimates --draws draws --out out --estimator './my_filter {run} {estimate}'
+```"""
 
 
 def readme_text(world: World, runs: int, odometry: Odometry) -> str:
@@ -42,7 +58,7 @@ def readme_text(world: World, runs: int, odometry: Odometry) -> str:
         "Motion": _motion(world),
         "Measurements": _measurements(world),
         "What to write": _estimates(world),
-        "How it is judged": _judging(),
+        "How it is judged": _JUDGING,
         "dataset.toml": _settings(world),
     }
     (title, first), *rest = sections.items()
@@ -75,8 +91,8 @@ def _files(world: World, odometry: Odometry) -> str:
         f"| `runs/0000/odometry.csv` | {_code((TIME, *odometry.names))} |",
         f"| `runs/0000/measurements.csv` | {_code(measured)} |",
         "| `runs/0000/dataset.toml` | the numbers below, for `jaxslam run` |",
-        "| `truth/0000/truth.csv` | `t [s]`, `x [m]`, `y [m]`, `theta [rad]`: the true pose at "
-        "each scan |",
+        f"| `truth/0000/truth.csv` | {_code((TIME, *world.motion.state))}: the true "
+        f"{_robot(world)} at each scan |",
     ]
     if sensor.landmark:
         lines.append("| `truth/0000/landmarks.csv` | `tag`, `x [m]`, `y [m]` of all landmarks |")
@@ -126,19 +142,20 @@ def _times(world: World, odometry: Odometry) -> str:
 
 def _start(world: World) -> str:
     cov = np.asarray(world.pose_cov, np.float64)
-    pose = f"```text\nx, y, theta = {_list(world.pose)}\n```"
+    robot, names = _robot(world), _state(world.motion)
+    pose = f"```text\n{names} = {_list(world.pose)}\n```"
     if not np.any(cov):
-        return f"The pose before the first motion is known exactly:\n\n{pose}"
+        return f"The {robot} before the first motion is known exactly:\n\n{pose}"
     return (
-        "The true pose before the first motion is drawn anew in each run, from the normal "
-        f"distribution of this mean and covariance (x, y, theta):\n\n{pose}\n\n"
+        f"The true {robot} before the first motion is drawn anew in each run, from the normal "
+        f"distribution of this mean and covariance ({names}):\n\n{pose}\n\n"
         f"```text\nP0 =\n{_rows(cov)}\n```"
     )
 
 
 def _motion(world: World) -> str:
     model = single_motion(world)
-    names = ", ".join(f"`w_{_bare(name)}`" for name in model.noises)
+    names = ", ".join(f"`w_{label(name)}`" for name in model.noises)
     if getattr(world, "noise_on", "robot") == "odometry":
         disturbed = (
             "In the simulation the noise is on the odometry: the robot moves without noise, and "
@@ -147,23 +164,30 @@ def _motion(world: World) -> str:
         )
     else:
         disturbed = "In the simulation the noise moves the robot; the odometry is the nominal one."
+    states = _state(model)
+    of_state = ""
+    if further := model.state[3:]:
+        of_state = f" Beside the pose the robot has {_code(further)}, which no odometry tells."
     return (
-        f"A line of odometry moves the pose (x, y, theta) to (x1, y1, theta1), with the noise "
-        f"{names}, independent from line to line, normal, of mean 0.\n\n"
+        f"A line of odometry moves the {_robot(world)} ({states}) to "
+        f"({', '.join(f'{name}1' for name in states.split(', '))}), with the noise "
+        f"{names}, independent from line to line, normal, of mean 0.{of_state}\n\n"
         f"{_equations(model)}\n\n{_noise(model, model.noises, 'w')}\n\n{disturbed}"
     )
 
 
 def _measurements(world: World) -> str:
     sensor = world.sensor
-    names = ", ".join(f"`n_{_bare(name)}`" for name in sensor.measurements)
+    names = ", ".join(f"`n_{label(name)}`" for name in sensor.measurements)
     frame, mount = _NO_MOUNT, (sensor.sensor if isinstance(sensor, Wrapped) else sensor).mount
     if mount is not None:
-        frame = f"mount_x, mount_y, mount_theta = {_list(mount)}\n{_MOUNT}"
-    landmark = ", ".join(f"`l_{_bare(name)}`" for name in sensor.landmark)
+        frame = f"mount = mount_x, mount_y, mount_theta = {_list(mount)}\n{_MOUNT}"
+    landmark = ", ".join(f"`l_{label(name)}`" for name in sensor.landmark)
     of = f" of the landmark ({landmark})" if sensor.landmark else ""
+    of_robot = "".join(f", {label(name)}" for name in sensor.robot)
     text = (
-        f"A measurement{of} from the pose (x, y, theta), with the noise {names}, independent from "
+        f"A measurement{of} from the {'robot' if of_robot else 'pose'} (x, y, theta{of_robot}), "
+        f"with the noise {names}, independent from "
         "measurement to measurement, normal, of mean 0. The pose of the sensor is\n\n"
         f"```python\n{frame}\n```\n\nand the measurement\n\n{_equations(sensor)}\n\n"
         f"{_noise(sensor, sensor.measurements, 'n')}"
@@ -218,7 +242,14 @@ def _estimates(world: World) -> str:
     rows, columns = np.triu_indices(size)
     nu = ",".join(f"nu_{i + 1}" for i in range(size))
     s = ",".join(f"s_{i + 1}{j + 1}" for i, j in zip(rows, columns, strict=True))
-    landmarks = ""
+    further = landmarks = ""
+    if names := list(map(label, world.motion.state[3:])):
+        rows, columns = np.triu_indices(len(names))
+        pairs = (f"c_{names[i]}_{names[j]}" for i, j in zip(rows, columns, strict=True))
+        further = (
+            f"; optional columns: `{','.join([*names, *pairs])}`, what the robot has beside the "
+            "pose, and the upper triangle of its covariance"
+        )
     if world.sensor.landmark:
         landmarks = (
             "\n| `estimates/0000/map.csv` (optional) | `landmark,x,y,c_xx,c_xy,c_yy` | the final "
@@ -228,7 +259,7 @@ def _estimates(world: World) -> str:
         "| file | columns | lines |\n|---|---|---|\n"
         "| `estimates/0000/trajectory.csv` | `time,x,y,theta,c_xx,c_xy,c_xt,c_yy,c_yt,c_tt` | a "
         "line a scan: its time, as in `truth.csv`, the pose after the scan is used, and the upper "
-        "triangle of the covariance of (x, y, theta) in the axes of the map |"
+        f"triangle of the covariance of (x, y, theta) in the axes of the map{further} |"
         f"{landmarks}\n| `estimates/0000/innovations.csv` (optional) | `t,tag,{nu},{s}` | a line a "
         "measurement of a landmark that the map has: its innovation nu (measured minus predicted, "
         "angles wrapped), and the upper triangle of its covariance S; optional columns: rejected, "
@@ -239,17 +270,6 @@ def _estimates(world: World) -> str:
         "the judge expects every tenth row alone. "
         f"{tags if world.sensor.landmark else ''}"
     ).rstrip()
-
-
-def _judging() -> str:
-    return (
-        "The judge is a command of the Python package `jaxslam`. It compares the errors with the "
-        "covariances (NEES, intervals, a verdict), beside filters of the package on the same runs, "
-        "and can run your program itself:\n\n```console\n"
-        "$ jaxslam judge estimates --draws draws --filters ekf --out out\n"
-        "$ jaxslam judge estimates --draws draws --out out --estimator './my_filter {run} "
-        "{estimate}'\n```"
-    )
 
 
 def _settings(world: World) -> str:
@@ -264,6 +284,16 @@ def _settings(world: World) -> str:
             f" The filters of the campaign have options that it does not say: {', '.join(options)}."
         )
     return text
+
+
+def _robot(world: World) -> str:
+    """What truth.csv has of the robot, in a word."""
+    return "pose" if len(world.motion.state) == 3 else "state"
+
+
+def _state(model: Motion) -> str:
+    """The names of a model's state, as its equations have them."""
+    return ", ".join(map(label, model.state))
 
 
 # --- models -------------------------------------------------------------------------------------
@@ -291,29 +321,34 @@ def _equations(model: Motion | Sensor) -> str:
 
 
 def _constants(model: object) -> Iterator[tuple[str, ArrayLike]]:
-    """The numbers of a record, and of the model that it holds, by field."""
+    """The numbers of a record, and of the model that it holds, by field; not those that vary."""
+    varying = model.parameters if isinstance(model, Augmented) else ()
     for field in dataclasses.fields(model):  # type: ignore[arg-type]
         value = getattr(model, field.name)
         if isinstance(value, Model):
-            yield from _constants(value)
-        elif field.name not in ("noise_cov", "mount", "free") and _is_number(value):
-            yield field.name, value
-
-
-def _is_number(value: object) -> bool:
-    try:
-        return np.asarray(value).dtype.kind in "iuf"
-    except ValueError:  # of several shapes, as a mean and its covariance
-        return False
+            yield from (row for row in _constants(value) if row[0] not in varying)
+        elif field.name not in ("noise_cov", "noise", "mount", "free"):
+            try:
+                kind = np.asarray(value).dtype.kind
+            except ValueError:  # of several shapes, as a mean and its covariance
+                continue
+            if kind in "iuf":
+                yield field.name, value
 
 
 def _noise(model: Motion | Sensor, names: tuple[str, ...], symbol: str) -> str:
     """The covariance of a model's noise, as numbers or as equations."""
-    bare = [f"{symbol}_{_bare(name)}" for name in names]
+    if isinstance(model, Augmented):
+        moves, walks = model.motion.noises, names[len(model.motion.noises) :]
+        variance = "sigma**2*dt" if INTERVAL in model.controls else "sigma**2"
+        return f"{_noise(model.motion, moves, symbol)}\n\n{_sigmas(walks, model.noise, variance)}"
+    bare = [f"{symbol}_{label(name)}" for name in names]
     units = [split_unit(name)[1] or "" for name in names]
     while isinstance(inner := getattr(model, "motion", getattr(model, "sensor", None)), Model):
         model = inner  # type: ignore[assignment]
     cov = model.noise_cov
+    if isinstance(cov, NoiseDensity):
+        return _sigmas(names, cov.sigma, "sigma**2/dt")
     if isinstance(cov, Constant):
         matrix = np.asarray(cov.cov, np.float64)
         if np.any(matrix - np.diag(np.diag(matrix))):
@@ -334,8 +369,12 @@ def _noise(model: Motion | Sensor, names: tuple[str, ...], symbol: str) -> str:
     )
 
 
-def _bare(name: str) -> str:
-    return split_unit(name)[0]
+def _sigmas(names: tuple[str, ...], sigma: ArrayLike, variance: str) -> str:
+    """The noises of a motion whose variance is a function of σ and the interval."""
+    values = np.broadcast_to(np.asarray(sigma, np.float64), (len(names),)).tolist()
+    labels = map(label, names)
+    lines = [f"| `w_{name}` | {value!r} |" for name, value in zip(labels, values, strict=True)]
+    return "\n".join([f"| noise, of variance `{variance}` | sigma |", "|---|---|", *lines])
 
 
 def _code(names: tuple[str, ...]) -> str:

@@ -21,7 +21,14 @@ from jaxslam.association import (
     MaximumLikelihood,
     Nearest,
 )
-from jaxslam.core.logs._tables import INTERVAL, POSE, TAG, TIME, measurement_columns
+from jaxslam.core.logs._tables import (
+    INTERVAL,
+    POSE,
+    TAG,
+    TIME,
+    measurement_columns,
+    split_unit,
+)
 from jaxslam.core.noise import Constant
 from jaxslam.core.protocols import Motion, Sensor
 from jaxslam.core.types import Log, Truth
@@ -73,9 +80,6 @@ def check_tables(world: World) -> None:
             f"{', '.join(part.sensor.name for part in sensor.parts)}"
         )
         raise InvalidField("sensor", reason, owner=owner)
-    if further := world.motion.state[3:]:
-        reason = f"expected a state that is the pose, as truth.csv has it, got {', '.join(further)}"
-        raise InvalidField("motion", reason, owner=owner)
     if sensor.landmark and not sensor.of_points and not sensor.landmark[0].startswith("x"):
         reason = (
             "expected landmarks that are points, as landmarks.csv has them, got "
@@ -142,6 +146,12 @@ def run_files(world: World, log: Log) -> Files:
         tag = np.where(has_unknown_tags(world), -1, np.asarray(scan.tag)[row, slot])
         columns.append(["" if number < 0 else str(number) for number in tag.tolist()])
     columns += map(_numbers, np.asarray(scan.z, np.float64)[row, slot].T)
+    sections = {
+        name: "".join(
+            f"{key} = {_toml(value)}\n" for key, value in section.items() if value is not None
+        )
+        for name, section in settings_of(world, odometry).items()
+    }
     return {
         "odometry.csv": _csv(
             (TIME, *odometry.names), [_numbers(odometry.time), *map(_numbers, odometry.values.T)]
@@ -149,14 +159,15 @@ def run_files(world: World, log: Log) -> Files:
         "measurements.csv": _csv(
             measurement_columns(sensor.measurements, sensor.landmark), columns
         ),
-        "dataset.toml": _toml_text(settings_of(world, odometry)),
+        "dataset.toml": "\n".join(f"[{name}]\n{text}" for name, text in sections.items()),
     }
 
 
 def truth_files(world: World, truth: Truth, log: Log) -> Files:
-    """The files of the truth of a run: the pose at each scan, and the landmarks by tag."""
-    rows, path = odometry_of(world, log.control).rows, np.asarray(truth.pose, np.float64)
-    files = {"truth.csv": _csv((TIME, *POSE), [_numbers(rows), *map(_numbers, path.T)])}
+    """The files of the truth of a run: the robot at each scan, and the landmarks by tag."""
+    rows, path = odometry_of(world, log.control).rows, np.asarray(truth.robot, np.float64)
+    names = (TIME, *POSE, *world.motion.state[3:])
+    files = {"truth.csv": _csv(names, [_numbers(rows), *map(_numbers, path.T)])}
     if world.sensor.landmark:
         points = np.asarray(with_positions(world.sensor, truth).landmarks, np.float64)
         tags = list(map(str, range(len(points))))
@@ -169,8 +180,10 @@ def truth_files(world: World, truth: Truth, log: Log) -> Files:
 
 def settings_of(world: World, odometry: Odometry) -> dict[str, dict[str, object]]:
     """The sections of dataset.toml; what they cannot say is text, which the reader refuses."""
+    of_motion, of_states = _motion_sections(world, odometry)
     return {
-        "motion": _motion_section(single_motion(world), odometry),
+        "motion": of_motion,
+        **({"state": of_states} if of_states else {}),
         "sensor": _sensor_section(world.sensor),
         "filter": _filter_section(world),
     }
@@ -192,30 +205,67 @@ def unsaid_options(world: World) -> list[str]:
     return sorted(set(world.filter_options) - {"correction", "gate", "associate", "births"})
 
 
-def _motion_section(model: Motion, odometry: Odometry) -> dict[str, object]:
+def _motion_sections(
+    world: World, odometry: Odometry
+) -> tuple[dict[str, object], dict[str, object]]:
+    """The sections of the motion and of the states beside the pose; the latter {} without any."""
+    model = line_motion = single_motion(world)
     errors: dict[str, object] = {}
+    states: tuple[str, ...] = ()
+    unit = "1"
+    if isinstance(model, motion.Augmented):
+        states, unit, model = model.parameters, model.unit, model.motion
     if isinstance(model, motion.Corrected):
         errors = {name: getattr(model, name) for name in ("scale", "wheels", "heading")}
         model = model.motion
-    name = _registered(model, motion.REGISTRY)
-    if name is None:
-        return {"model": f"{model.name}: {_UNSAID}"}
-    section = {"model": name, "noise": _motion_deviations(model, odometry)}
-    return section | _arguments(model) | errors
+    name, further = _registered(model, motion.REGISTRY), model.state[3:]
+    # The reader makes states of errors of the odometry alone, beside no other, in units of 1.
+    readable = not states or (not further and set(states) <= errors.keys() and unit == "1")
+    if name is None or not readable:
+        return {"model": f"{line_motion.name}: {_UNSAID}"}, {}
+    noise, walks = _motion_deviations(model, odometry)
+    section = {"model": name, "noise": noise} | _arguments(model)
+    section |= {key: value for key, value in errors.items() if key not in states}
+    if not (states or further):
+        return section, {}
+    if isinstance(line_motion, motion.Augmented):
+        walks = np.broadcast_to(
+            np.asarray(line_motion.noise, np.float64), (len(line_motion.state) - 3,)
+        )
+    cov = np.asarray(world.pose_cov, np.float64)
+    correlated = np.any(cov[3:, :3]) or np.any(cov[3:, 3:] - np.diag(np.diag(cov)[3:]))
+    return section, {
+        "names": states or [split_unit(name)[0] for name in further],
+        "start": np.asarray(world.pose, np.float64)[3:],
+        "start_noise": _UNSAID if correlated else np.sqrt(np.diag(cov)[3:]),
+        "noise": walks,
+    }
 
 
-def _motion_deviations(model: Motion, odometry: Odometry) -> object:
-    """The standard deviations of a line of odometry, if they say the noise.
+def _motion_deviations(model: Motion, odometry: Odometry) -> tuple[object, object]:
+    """The standard deviations of a line of odometry, and of the model's own states in a second.
 
-    The reader scales the variance of velocities by the median interval over the line's own.
+    None without one. The reader scales the variance of velocities by the median interval over the
+    line's own.
     """
     cov, dt = model.noise_cov, odometry.intervals
+    beside = len(model.state) - 3  # whose rates are the last noises
+    line = np.median(np.diff(odometry.time)) if dt.size else 1.0
     if isinstance(cov, motion.WhiteNoise) and not np.any(cov.turn_share):
-        density = np.array([cov.travel, cov.turn], np.float64)
-        return density / np.sqrt(np.median(np.diff(odometry.time)))
-    if not isinstance(cov, Constant) or (dt.size and np.ptp(dt) > 1e-9 * dt.max()):
-        return _UNSAID
-    return _deviations(cov.cov)
+        deviations: object = np.array([cov.travel, cov.turn], np.float64) / np.sqrt(line)
+    elif isinstance(cov, motion.NoiseDensity) and dt.size:
+        density = np.broadcast_to(np.asarray(cov.sigma, np.float64), (len(model.noises),))
+        deviations = density / np.sqrt(line)
+    elif not isinstance(cov, Constant) or (dt.size and np.ptp(dt) > 1e-9 * dt.max()):
+        deviations = _UNSAID
+    else:
+        deviations = _deviations(cov.cov)
+    if not beside:
+        return deviations, None
+    if not isinstance(deviations, np.ndarray):
+        return deviations, deviations
+    measured = len(model.noises) - beside
+    return deviations[:measured] if measured else None, deviations[measured:] * np.sqrt(line)
 
 
 def _sensor_section(model: Sensor) -> dict[str, object]:
@@ -240,11 +290,11 @@ def _sensor_section(model: Sensor) -> dict[str, object]:
 
 def _filter_section(world: World) -> dict[str, object]:
     """The start, and the options of the campaign's filters."""
-    cov, options = np.asarray(world.pose_cov, np.float64), world.filter_options
+    cov, options = np.asarray(world.pose_cov, np.float64)[:3, :3], world.filter_options
     diagonal = not np.any(cov - np.diag(np.diag(cov)))
     spread = {"start_noise": np.sqrt(np.diag(cov))} if diagonal else {"start_covariance": cov}
     section: dict[str, object] = {
-        "start": world.pose,
+        "start": np.asarray(world.pose, np.float64)[:3],
         **spread,
         "capacity": int(np.shape(world.landmarks)[0]),
         "update": options.get("correction", "sequential"),
@@ -257,20 +307,17 @@ def _filter_section(world: World) -> dict[str, object]:
         return section | {"associate": "known", "gate": gate}
     probability = getattr(rule, "probability", getattr(rule, "gate", None))
     method = _METHODS.get(type(rule))
+    further = [
+        field.name
+        for field in dataclasses.fields(rule)
+        if field.name not in ("gate", "new_gate", "probability")
+        and getattr(rule, field.name) != field.default
+    ]
     # A rule with further options is no method of the reader's, nor is one with a gate behind it.
-    if method is None or probability is None or gate is not None or _is_unusual(rule):
+    if method is None or probability is None or gate is not None or further:
         return section | {"associate": f"{rule!r}: {_UNSAID}"}
     new_gate = probability if rule.new_gate is None else rule.new_gate
     return section | {"associate": method, "gate": probability, "new_gate": new_gate}
-
-
-def _is_unusual(rule: object) -> bool:
-    """Whether a rule has other options than its gates, whose value is not the default."""
-    return any(
-        getattr(rule, field.name) != field.default
-        for field in dataclasses.fields(rule)  # type: ignore[arg-type]
-        if field.name not in ("gate", "new_gate", "probability")
-    )
 
 
 def _registered(model: Motion | Sensor, registry: Mapping[str, object]) -> str | None:
@@ -302,16 +349,6 @@ def _numbers(values: Float[np.ndarray, "K"]) -> list[str]:
 def _csv(header: Sequence[str], columns: Sequence[Sequence[str]]) -> str:
     lines = [",".join(header), *map(",".join, zip(*columns, strict=True))]
     return "\n".join(lines) + "\n"
-
-
-def _toml_text(sections: Mapping[str, Mapping[str, object]]) -> str:
-    return "\n".join(
-        f"[{name}]\n"
-        + "".join(
-            f"{key} = {_toml(value)}\n" for key, value in section.items() if value is not None
-        )
-        for name, section in sections.items()
-    )
 
 
 def _toml(value: object) -> str:

@@ -120,8 +120,14 @@ def write_draws(
     write_record()
     _write(folder / "README.md", readme_text(world, runs, odometry))
     names = [f"{number:04d}" for number in range(runs)]
-    intact = _intact_runs(folder, checksums)
-    missing = [number for number, name in enumerate(names) if name not in intact]
+    # Runs whose files are all there, as they were written, are not drawn again.
+    present: dict[str, bool] = {}
+    for file, checksum in checksums.items():
+        name = file.split("/")[1]
+        present[name] = present.get(name, True) and (folder / file).is_file()
+        if present[name] and _sha256((folder / file).read_bytes()) != checksum:
+            raise ValueError(f"{folder / file} was changed: restore it, or choose another folder")
+    missing = [number for number, name in enumerate(names) if not present.get(name)]
     try:
         for count, (number, (truth, log)) in enumerate(_histories(world, missing, key), 1):
             name, run, true = names[number], run_files(world, log), truth_files(world, truth, log)
@@ -214,20 +220,6 @@ def _earlier_checksums(folder: Path, campaign: Mapping[str, str], runs: int) -> 
     if runs < count:
         raise ValueError(f"{folder} holds {count} runs: expected at least as many, got {runs}")
     return {str(name): str(value) for name, value in checksums.items()}
-
-
-def _intact_runs(folder: Path, checksums: Mapping[str, str]) -> set[str]:
-    """The names of the runs whose files are all there, as they were written.
-
-    Raises ValueError on a file that was changed.
-    """
-    present: dict[str, bool] = {}
-    for file, checksum in checksums.items():
-        name = file.split("/")[1]
-        present[name] = present.get(name, True) and (folder / file).is_file()
-        if present[name] and _sha256((folder / file).read_bytes()) != checksum:
-            raise ValueError(f"{folder / file} was changed: restore it, or choose another folder")
-    return {name for name, is_present in present.items() if is_present}
 
 
 def _write_run(folder: Path, name: str, run: Files, truth: Files) -> None:

@@ -132,8 +132,31 @@ def statistics_of(
         shapes: of the faults, and of slips in parts of the log.
     """
     run = FusedInnovations.of(info, z, sensor.measurements)
+    size = run.nu.shape[1]
     statistics = [*_sizes(run, sensor, rates, time), *_correlations(run, sensor, rates)]
-    statistics += [*_tails(run, sensor), *_faults(info, shapes)]
+
+    # The tails of the distribution, whatever the size.
+    limit = float(chi2_quantile(_TAIL, size)) * _mean(run.nis)
+    beyond = tail_count(np.sort(size * run.nis), limit)
+    statistics.append(_count("tail", "above the 99 % quantile", beyond, max(len(run.nis), 1)))
+    for i, name in enumerate(_names(sensor)):
+        square = _mean(run.unit[:, i] ** 2)
+        kurtosis = _mean(run.unit[:, i] ** 4) / square**2 if square > 0 else np.nan
+        statistics.append(_positive("kurtosis", name, kurtosis))
+
+    # The amount of each fault, and the slip of the part of the log in which it is clearest.
+    innovation = np.where(fused_of(info)[..., None], np.asarray(info.innovation, np.float64), 0.0)
+    faults, slips = shapes
+    for shape in faults:
+        amount = shape.amount(innovation)
+        statistics.append(Statistic("fault", shape.fault.name, amount, amount))
+    if slips:
+        amounts = np.array([shape.amount(innovation) for shape in slips])
+        clear = np.abs(amounts) * np.sqrt([shape.information for shape in slips])
+        k = int(np.argmax(clear))
+        score = float(np.log(clear[k]))
+        statistics.append(Statistic("fault", "slip", float(amounts[k]), score, str(k)))
+
     rejected = int((np.asarray(info.status) == Status.REJECTED).sum())
     statistics.append(_count("rejected by the gate", "", rejected, max(int(valid.sum()), 1)))
     likelihood = float(np.asarray(info.log_likelihood, np.float64).sum())
@@ -153,12 +176,7 @@ def _sizes(
         weight = 1 / run.cov[:, i, i]
         mean = (run.nu[:, i] * weight).sum() / weight.sum() if len(weight) else np.nan
         yield Statistic("mean", name, float(mean), float(mean))
-    by: dict[str, np.ndarray] = {}
-    if (distance := _distance(run, sensor)) is not None:
-        by["range"] = distance
-    if (bearing := _bearing(run, sensor)) is not None:
-        by["bearing"] = bearing
-    by["turn rate"] = np.abs(rates.turn[run.row])
+    by = _polar(run, sensor) | {"turn rate": np.abs(rates.turn[run.row])}
     level = _mean(run.nis)
     for quantity, values in by.items():
         parts = np.array_split(np.argsort(values, kind="stable"), 3)
@@ -189,23 +207,11 @@ def _correlations(run: FusedInnovations, sensor: Sensor, rates: Rates) -> Iterat
         value = _products(unit[1:, i][pairs], unit[:-1, i][pairs])
         yield Statistic("autocorrelation", f"{name}, lag 1", value, value)
     by = {"speed": rates.speed[run.row], "turn rate": rates.turn[run.row]}
-    if (distance := _distance(run, sensor)) is not None:
-        by["range"] = distance
+    by |= {name: values for name, values in _polar(run, sensor).items() if name == "range"}
     for i, name in enumerate(_names(sensor)):
         for quantity, values in by.items():
             value = _correlation(run.unit[:, i], values)
             yield Statistic("correlation", f"{name} with {quantity}", value, value)
-
-
-def _tails(run: FusedInnovations, sensor: Sensor) -> Iterator[Statistic]:
-    """The tails of the distribution of the innovations, whatever their size."""
-    size = run.nu.shape[1]
-    beyond = tail_count(np.sort(size * run.nis), float(chi2_quantile(_TAIL, size)) * _mean(run.nis))
-    yield _count("tail", "above the 99 % quantile", beyond, max(len(run.nis), 1))
-    for i, name in enumerate(_names(sensor)):
-        square = _mean(run.unit[:, i] ** 2)
-        kurtosis = _mean(run.unit[:, i] ** 4) / square**2 if square > 0 else np.nan
-        yield _positive("kurtosis", name, kurtosis)
 
 
 def tail_count(increasing: Float[np.ndarray, "N"], limit: float) -> float:
@@ -223,43 +229,19 @@ def tail_count(increasing: Float[np.ndarray, "N"], limit: float) -> float:
     return above - 1 + (least - limit) / (least - below)
 
 
-def _faults(info: Info, shapes: tuple[list[Shape], list[Shape]]) -> Iterator[Statistic]:
-    """The amount of each fault, and the slip of the part of the log in which it is clearest."""
-    fused = fused_of(info)
-    innovation = np.where(fused[..., None], np.asarray(info.innovation, np.float64), 0.0)
-    faults, slips = shapes
-    for shape in faults:
-        amount = shape.amount(innovation)
-        yield Statistic("fault", shape.fault.name, amount, amount)
-    if slips:
-        amounts = np.array([shape.amount(innovation) for shape in slips])
-        clear = np.abs(amounts) * np.sqrt([shape.information for shape in slips])
-        k = int(np.argmax(clear))
-        yield Statistic("fault", "slip", float(amounts[k]), float(np.log(clear[k])), str(k))
-
-
 def _names(sensor: Sensor) -> list[str]:
     return [split_unit(name)[0] for name in sensor.measurements]
 
 
-def _distance(run: FusedInnovations, sensor: Sensor) -> np.ndarray | None:
-    """The predicted distance of each measurement; None where nothing says it."""
+def _polar(run: FusedInnovations, sensor: Sensor) -> dict[str, np.ndarray]:
+    """The predicted range and bearing of each measurement, as far as something says them."""
     names = _names(sensor)
-    if "range" in names:
-        return run.predicted[:, names.index("range")]
     if names[:2] == ["ahead", "left"]:
-        return np.asarray(np.hypot(*run.predicted[:, :2].T))
-    return None
-
-
-def _bearing(run: FusedInnovations, sensor: Sensor) -> np.ndarray | None:
-    """The predicted bearing of each measurement; None where nothing says it."""
-    names = _names(sensor)
-    if "bearing" in names:
-        return run.predicted[:, names.index("bearing")]
-    if names[:2] == ["ahead", "left"]:
-        return np.asarray(np.arctan2(run.predicted[:, 1], run.predicted[:, 0]))
-    return None
+        ahead, left = run.predicted[:, :2].T
+        return {"range": np.hypot(ahead, left), "bearing": np.arctan2(left, ahead)}
+    return {
+        name: run.predicted[:, names.index(name)] for name in ("range", "bearing") if name in names
+    }
 
 
 def _mean(values: np.ndarray) -> float:

@@ -18,6 +18,7 @@ from jax.sharding import NamedSharding
 from jax.typing import DTypeLike
 from jaxtyping import Float, PyTree
 
+from jaxslam.consistency._check_sentences import Meaning
 from jaxslam.consistency._intervals import LEVEL
 from jaxslam.consistency._log_statistics import (
     GENERAL,
@@ -27,19 +28,16 @@ from jaxslam.consistency._log_statistics import (
     statistics_of,
 )
 from jaxslam.consistency._planted_faults import (
-    Shape,
     body_rates,
     faults_of,
     planted_logs,
     shapes_of,
-    window_rows,
 )
 from jaxslam.consistency.campaign._block_programs import mesh_of, programs, spec
 from jaxslam.consistency.campaign._candidates import candidate_for, cast_floats, check_dtype
 from jaxslam.consistency.campaign._work import Report
 from jaxslam.core._record import as_record
 from jaxslam.core._validation import log_of
-from jaxslam.core.logs._tables import split_unit
 from jaxslam.core.protocols import Filter
 from jaxslam.core.types import Info, Log, Scan, Truth
 from jaxslam.core.validation import (
@@ -216,6 +214,8 @@ def check_models(
         block = -(-twins // (blocks * len(devices)))
         block = max(block, min(-(-_PLANTED // len(devices)), BLOCK))
     runs = _Runs(world, filter, key, devices, block, check_dtype(dtype))
+
+    # The filter over the log, and over logs in which a fault each is planted.
     faults, slips = faults_of(world)
     truth, planted = jax.device_get(planted_logs(world, faults, slips))
     recorded = jax.tree.map(lambda leaf: np.asarray(leaf)[None], log)
@@ -227,18 +227,22 @@ def check_models(
         wide: PyTree = tuple(_widen(leaf, spare) for leaf in logs.scan)
         logs = logs._replace(scan=Scan(*wide))
         truth = truth._replace(origin=_widen(truth.origin[None], spare)[0])
-    count = len(logs.control)
-    total = twins + count
     infos = runs.of_logs(truth, logs)
     fused = fused_of(infos)
     with refusals_of("check_models"):
         if not fused.any():
             raise InvalidField("filter", "expected one with innovations, got none in its Info")
+    count = len(logs.control)
+    total = twins + count
     if progress is not None:
         progress(count, total)
+
+    # What each fault does to the innovations tells how much of it a run has.
     innovations = np.where(fused[..., None], np.asarray(infos.innovation, np.float64), 0.0)
     covs = np.asarray(infos.innovation_cov, np.float64)[1]
     shapes = shapes_of(faults, slips, innovations[1:], np.where(fused[1, ..., None, None], covs, 0))
+
+    # The statistics of the log, and of the twins, a block at a time.
     speed, _, turn = body_rates(world).T
     rates, time = Rates(speed, turn), np.asarray(world.time, np.float64)
 
@@ -253,7 +257,7 @@ def check_models(
             of_twins.append(statistics(_run(some, i), scan.z[i], scan.valid[i]))
         if progress is not None:
             progress(count + len(of_twins), total)
-    checked = compare(of_log, of_twins, _Meaning(world, _run(infos, 0), shapes))
+    checked = compare(of_log, of_twins, Meaning(world, _run(infos, 0), shapes))
     return ModelCheck(
         name=world.name.removeprefix("twin of "),
         filter=filter_name or filter.name,
@@ -394,85 +398,3 @@ def holm(p: Float[np.ndarray, "S"], weights: Float[np.ndarray, "S"]) -> Float[np
     corrected = np.empty(len(p))
     corrected[order] = np.minimum(np.maximum.accumulate(p[order] / weights[order] * left), 1.0)
     return corrected
-
-
-class _Meaning:
-    """What statistics of a log say, as sentences."""
-
-    def __init__(self, world: Twin, info: Info, shapes: tuple[list[Shape], list[Shape]]) -> None:
-        self._units = dict(map(split_unit, world.sensor.measurements))
-        self._time = np.asarray(world.time)
-        self._faults = {shape.fault.name: shape.fault for part in shapes for shape in part}
-        seen, slot = np.asarray(world.seen), np.asarray(info.slot)
-        held = (slot >= 0) & (seen >= 0)
-        self._landmarks = {
-            str(k): world.tags[row] for k, row in zip(slot[held], seen[held], strict=True)
-        }
-
-    def __call__(self, statistic: Statistic, twins: Float[np.ndarray, "R"]) -> str:
-        family, detail, value, place = statistic[:3] + (statistic.place,)
-        typical = float(np.median(twins))
-        larger = value > typical
-        beside = f"{value:.3g}, of the twins {typical:.3g}"
-        unit = self._units.get(detail) or ""
-        if family.startswith("NIS / dof by"):
-            quantity = family.removeprefix("NIS / dof by ")
-            return (
-                f"NIS / dof in the {detail} of the {quantity} is {beside}; "
-                f"a noise or an error that depends on the {quantity}"
-            )
-        if family == "autocorrelation" and ", " in detail:
-            pairs = f"successive innovations of the {detail.split(', ')[0]} of a landmark are"
-            return f"{pairs} correlated: {beside}; errors that last: [filter] spacing"
-        if family == "correlation":
-            component, _, quantity = detail.partition(" with ")
-            cause = {
-                "speed": "a delay, slip or a scale of the odometry",
-                "turn rate": "a delay: jaxslam fit --calibrate delay; or the scale of turns",
-                "range": "a scale of the range: jaxslam fit --calibrate range",
-            }[quantity]
-            grows = "grows" if larger else "falls"
-            return (
-                f"the innovation of the {component} {grows} with the {quantity}: correlation "
-                f"{beside}; {cause}"
-            )
-        if family == "fault":
-            fault = self._faults[detail]
-            spread = fault.scale * float(np.std(twins))
-            shown = f"{fault.scale * value:.3g} {fault.unit} (twins ± {spread:.2g})"
-            when = ""
-            if detail == "slip":
-                when = f" {self._window(place)}"
-            return f"{fault.meaning.format(shown)}{when}; {fault.remedy}"
-        size = "larger" if larger else "smaller"
-        noise = "small" if larger else "large"
-        return {
-            "NIS / dof": f"innovations are {size} than the models say: NIS / dof {beside}; noises "
-            f"too {noise}, or an error below: jaxslam fit",
-            "size": f"the innovation of the {detail} is {size} than the models say: ν²/S {beside}; "
-            f"its noise is too {noise}: jaxslam fit",
-            "mean": f"the innovation of the {detail} is {value:.3g} {unit} on average, of the "
-            f"twins {typical:.3g}; a constant error: jaxslam fit --calibrate mount, range",
-            "NIS / dof of a landmark": f"NIS / dof of landmark {self._landmarks.get(place, place)} "
-            f"is {beside} for their worst; it moved, or is not one point",
-            "NIS trend": f"NIS {'grows' if larger else 'falls'} with time: correlation {beside}; "
-            "a constant that changes, or a map that bends",
-            "NIS / dof of a time": f"NIS / dof is {beside} for their worst tenth, "
-            f"{self._window(place)}; something happened there",
-            "autocorrelation": f"innovations of a landmark are correlated at {detail}: {beside}; "
-            "errors that last: [filter] spacing",
-            "tail": f"the NIS over its mean is {detail} in {100 * value:.2g} %, of the twins "
-            f"{100 * typical:.2g} %; wrong measurements: [filter] gate",
-            "kurtosis": f"the innovation of the {detail} has a kurtosis of {beside}; "
-            + ("wrong measurements: [filter] gate" if larger else "no Gaussian noise"),
-            "rejected by the gate": f"the gate rejects {100 * value:.2g} %, of the twins "
-            f"{100 * typical:.2g} %; wrong measurements, or noises too small",
-            "log-likelihood": f"the log-likelihood is {value:.5g}, of the twins {typical:.5g}; "
-            "noises that do not fit: jaxslam fit",
-        }[family]
-
-    def _window(self, place: str) -> str:
-        if not place:
-            return ""
-        rows = self._time[window_rows(len(self._time), int(place))]
-        return f"from {rows[0]:.4g} to {rows[-1]:.4g} s"

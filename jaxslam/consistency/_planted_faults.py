@@ -22,6 +22,7 @@ from jaxslam.core.logs._tables import INTERVAL, split_unit
 from jaxslam.core.protocols import Motion
 from jaxslam.core.types import Log, Scan, Truth
 from jaxslam.math import se2
+from jaxslam.sensors._suite import of_robot
 from jaxslam.simulation._twin import Twin
 
 PARTS = 20
@@ -202,15 +203,19 @@ def averaged_controls(
 def body_rates(world: Twin) -> Float[np.ndarray, "T 3"]:
     """Speed ahead and to the left [m/s], and turn rate [rad/s], in each row, by the odometry."""
     controls, interval = averaged_controls(world)
-    moves = jax.device_get(_moves(world.motion, controls.astype(jnp.result_type(float))))
+    dtype = jnp.result_type(float)
+    origin = jnp.asarray(world.pose, dtype).at[:3].set(0)
+    moves = jax.device_get(_moves(world.motion, origin, controls.astype(dtype)))
     lasts = interval[:, None] > 0
     return np.where(lasts, np.asarray(moves, np.float64) / np.where(lasts, interval[:, None], 1), 0)
 
 
 @jax.jit
-def _moves(motion: Motion, controls: Float[Array, "T U"]) -> Float[Array, "T 3"]:
-    """The nominal motion of each row, in the robot's frame."""
-    origin, still = jnp.zeros(3, controls.dtype), jnp.zeros(len(motion.noises), controls.dtype)
+def _moves(
+    motion: Motion, origin: Float[Array, "R"], controls: Float[Array, "T U"]
+) -> Float[Array, "T 3"]:
+    """The nominal motion of each row, in the robot's frame. origin: a robot there."""
+    still = jnp.zeros(len(motion.noises), controls.dtype)
     return jax.vmap(lambda u: motion.step(origin, u, still)[:3])(controls)
 
 
@@ -253,6 +258,7 @@ def _plant(
     path, logged = world.drive(start, jnp.zeros_like(jnp.asarray(world.noise, dtype)))
     landmarks, (controls, twist) = jnp.asarray(world.landmarks, dtype), nominal
     seen = jnp.asarray(world.seen, jnp.int32)
+    sensor = of_robot(world.sensor, world.motion.state)
     travel, turn, distance, ranges, bearing = (jnp.asarray(part, dtype) for part in columns[:5])
 
     def log_with(amount: Amounts) -> Log:
@@ -261,7 +267,7 @@ def _plant(
         poses = path.at[:, :3].set(back)
 
         def measure(pose: Array, row: Array) -> Array:
-            z = world.sensor.observe(pose, landmarks[jnp.maximum(row, 0)])
+            z = sensor.observe(pose, landmarks[jnp.maximum(row, 0)])
             if columns.cartesian:
                 ahead, left = se2.to_frame(
                     jnp.stack([0.0 * z[0], 0.0 * z[0], amount.turned]), z[:2]
@@ -269,7 +275,7 @@ def _plant(
                 z = z.at[:2].set(jnp.stack([ahead, left]))
             z = z * (1 + amount.longer * distance) + amount.offset * ranges
             z = z - amount.turned * bearing
-            residual: Array = world.sensor.residual(z, jnp.zeros_like(z))
+            residual: Array = sensor.residual(z, jnp.zeros_like(z))
             return residual
 
         z = jax.vmap(jax.vmap(measure, (None, 0)))(poses, seen)
@@ -280,7 +286,9 @@ def _plant(
         bent = amount.bending * (controls @ first_travel)[:, None] * first_turn[None]
         return Log(logged + controls * scales + bent, scan)
 
-    truth = Truth(path, landmarks, jnp.zeros(len(path), jnp.int32), start)
+    missed = jnp.zeros(len(path), jnp.int32)
+    further = None if path.shape[1] == 3 else path[:, 3:]
+    truth = Truth(path[:, :3], landmarks, missed, start, further=further)
     if world.associates or world.spurious is not None:
         truth = truth._replace(origin=seen)
     return truth, jax.vmap(log_with)(amounts)

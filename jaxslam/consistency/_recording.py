@@ -14,12 +14,14 @@ import scipy
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
+from jaxslam.consistency._correlated import error_of_sum, mean_of, mean_square, share_within
 from jaxslam.consistency._intervals import LEVEL, Average, percentage
 from jaxslam.consistency._measures.nees import DOF
+from jaxslam.consistency._recorded_errors import AXES, SHORTEST, STEPS, Alignment, Claims, Rows
 from jaxslam.consistency._verdict import TOLERANCE
 from jaxslam.consistency.metrics._paths import alignment
+from jaxslam.core._table import Row, Table, text_of
 from jaxslam.core._units import are_headings_in_degrees
-from jaxslam.core.logs._streams import geodesic_poses, known_poses
 from jaxslam.core.validation import (
     InvalidField,
     array_of,
@@ -29,9 +31,8 @@ from jaxslam.core.validation import (
     refusals_of,
     require,
 )
-from jaxslam.math._definite import is_asymmetric, is_invertible
-from jaxslam.math.numpy_poses import compose, inverse, wrapped
-from jaxslam.math.stats import chi2_quantile, normal_quantile, t_quantile
+from jaxslam.math.numpy_poses import compose
+from jaxslam.math.stats import chi2_quantile, t_quantile
 
 COMPONENTS = ("along", "across", "heading")
 """The components of the error, in the axes of the estimate."""
@@ -42,12 +43,6 @@ LEVELS = (0.5, 0.9, 0.95, 0.99)
 ALIGNMENTS = ("none", "first", "best")
 FRAMES = ("world", "body")
 
-LARGEST = 1e4
-"""A variance above it [m², rad²] stands for an unknown coordinate: 1e6 and 99999 are usual."""
-
-_AXES = {"pose": slice(0, 3), "position": slice(0, 2), "heading": slice(2, 3)}
-"""The rows of the error of each block of `DOF`."""
-
 _FAULTY = 0.05
 """Share of the poses without a valid covariance beyond which the others do not decide, as of the
 runs of a campaign."""
@@ -55,16 +50,6 @@ runs of a campaign."""
 _SHARE_OF_FRAMES = 0.1
 """Share of the position errors that the best rigid motion leaves, below which the estimate and the
 truth may be in two frames."""
-
-_HALF = 0.1
-"""Half of the time over which the velocity of the truth is taken [s], at least: the noise of a
-motion capture at 100 Hz, 1 mm, is then 7 mm/s, and a robot's velocity hardly changes."""
-
-_ORDERS = 30
-"""Orders of the correlation of indicators; the shares of higher ones are taken for independent."""
-
-_STEPS, _SHORTEST = 10, 1e-7
-"""Gauss-Newton steps to the lag at most, and the step [s] that ends them."""
 
 
 class RecordedBlock(NamedTuple):
@@ -134,50 +119,45 @@ class RecordingScores:
     doubts: tuple[str, ...]
     """sentences that qualify the verdict, and on alignment and lag"""
 
-    def rows(self) -> list[tuple[str, str, str, str]]:
-        """The table: label, value with interval, honest value, number of independent errors."""
+    def rows(self) -> list[Row]:
+        """The table: label; value with interval, honest value, number of independent errors."""
         time = self.errors.time
         span = time[-1] - time[0]
         rows = [
-            ("", f"value [{percentage(LEVEL)}]", "honest", "independent errors"),
-            ("verdict", self.verdict + "*" * bool(self.doubts), "consistent", ""),
-            ("poses compared", f"{len(time):,} over {span:,.4g} s", "", ""),
+            Row("verdict", [self.verdict + "*" * bool(self.doubts), "consistent", ""]),
+            Row("poses compared", [f"{len(time):,} over {span:,.4g} s", "", ""]),
         ]
         for name, block in self.blocks.items():
             honest = _range_text(block.honest)
             count = f"{block.independent:,.0f} of {block.poses:,}"
-            rows.append((f"NEES, {name}", _text(block.nees), honest, count))
+            rows.append(Row(f"NEES, {name}", [_text(block.nees), honest, count]))
         for name, block in self.blocks.items():
             for level, share in block.coverage.items():
                 ends = tuple(100 * end for end in block.honest_coverage[level])
-                label = f"within the {percentage(level)} set, {name} [%]"
-                rows.append((label, _text(share, 100.0), _range_text(ends), ""))
+                label = f"within the {percentage(level)} set, {name}"
+                rows.append(Row(label, [_text(share, 100.0), _range_text(ends), ""], "%"))
         for name, factor in self.factors.items():
-            rows.append((f"σ too small by, {name}", _text(factor), "1", ""))
+            rows.append(Row(f"σ too small by, {name}", [_text(factor), "1", ""]))
         for name in COMPONENTS:
             unit, scale = ("°", np.rad2deg(1.0)) if name == "heading" else ("m", 1.0)
-            rows.append((f"RMSE, {name} [{unit}]", f"{scale * self.rmse[name]:.3g}", "", ""))
-            rows.append((f"mean error, {name} [{unit}]", _text(self.mean[name], scale), "", ""))
+            rows.append(Row(f"RMSE, {name}", [f"{scale * self.rmse[name]:.3g}", "", ""], unit))
+            rows.append(Row(f"mean error, {name}", [_text(self.mean[name], scale), "", ""], unit))
         if self.lag is not None:
-            rows.append(("lag of the estimate [ms]", _text(self.lag.seconds, 1e3), "0", ""))
-            rows.append(("  its standard error", f"{1e3 * self.lag.error:.2g}", "", ""))
+            rows.append(Row("lag of the estimate", [_text(self.lag.seconds, 1e3), "0", ""], "ms"))
+            rows.append(Row("  its standard error", [f"{1e3 * self.lag.error:.2g}", "", ""]))
             for name, nees in self.lag.nees.items():
                 honest = _range_text(self.blocks[name].honest)
-                rows.append((f"  NEES without it, {name}", _text(nees), honest, ""))
+                rows.append(Row(f"  NEES without it, {name}", [_text(nees), honest, ""]))
             if self.lag.nees:
-                rows.append(("  verdict without it", self.lag.verdict, "", ""))
+                rows.append(Row("  verdict without it", [self.lag.verdict, "", ""]))
         return rows
 
     def __str__(self) -> str:
-        rows = self.rows()
-        widths = [max(len(row[k]) for row in rows) for k in range(4)]
-        lines = [
-            "  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]).rstrip()
-            for row in rows
-        ]
+        heads = "", f"value [{percentage(LEVEL)}]", "honest", "independent errors"
         dropped = [f"{count:,} of the poses: {reason}" for reason, count in self.dropped.items()]
         doubts = [f"* {doubt}" for doubt in self.doubts]
-        return "\n".join([*lines, *([""] * bool(dropped or doubts)), *dropped, *doubts])
+        table = text_of(Table(heads, self.rows()))
+        return "\n".join([table, *([""] * bool(dropped or doubts)), *dropped, *doubts])
 
 
 def judge_recording(
@@ -265,7 +245,8 @@ def judge_recording(
         if estimate[2] is not None:
             cov = np.asarray(estimate[2], np.float64)
             require("estimate: covariances", cov, array_of(len(time), 3, 3))
-    rows = _Rows(time, pose, clock, path, longest_gap)
+    # The truth at the times of the estimate, in one frame with it, and the errors that are claimed.
+    rows = Rows(time, pose, clock, path, longest_gap)
     true, is_known = rows.truth()
     if is_known.sum() < 2:
         raise InvalidField(
@@ -275,66 +256,49 @@ def judge_recording(
             f"{int(is_known.sum())}",
             owner="judge_recording",
         )
-    dropped: dict[str, int] = {}
-    outside = (time < clock[0]) | (time > clock[-1])
-    if count := int((outside & ~is_known).sum()):
-        dropped["before the first or after the last time of the truth"] = count
-    if count := int((~outside & ~is_known).sum()):
-        dropped["in a gap of the truth"] = count
-    claims = _Claims.of(cov, pose, covariance_frame)
-    aligned = _Alignment.of(align, claims, pose, true, is_known)
+    claims = Claims.of(cov, pose, covariance_frame)
+    aligned = Alignment.of(align, claims, pose, true, is_known)
     is_compared = is_known.copy()
     if align == "first":
         is_compared[np.argmax(is_known)] = False  # its error is zero by construction
-        dropped["the first, to which the truth is aligned"] = 1
-    for reason, faulty in claims.faults.items():
-        if count := int((faulty & is_compared).sum()):
-            dropped[reason] = count
-    error = aligned.error
     judged = {name: claims.valid[name] & is_compared for name in DOF}
+    of_poses = time, aligned.error, claims.sigma(), pose, aligned.truth
+    errors = RecordedErrors(*(part[is_compared] for part in of_poses))
+    is_outside = (time < clock[0]) | (time > clock[-1])
+    left_out = {
+        "before the first or after the last time of the truth": is_outside & ~is_known,
+        "in a gap of the truth": ~is_outside & ~is_known,
+        "the first, to which the truth is aligned": is_known & ~is_compared,
+        **{reason: faulty & is_compared for reason, faulty in claims.faults.items()},
+    }
+
+    # The scores: NEES by block, factors of σ by component, the lag of the clocks.
     blocks = _blocks(aligned, judged)
     factors = {}
     for k, name in enumerate(COMPONENTS):
         valid = judged["heading" if name == "heading" else "position"]
         if valid.sum() > 1:
-            scaled = error[valid, k] / np.sqrt(claims.cov[valid, k, k])
-            low, high = aligned.honest(k, valid)
-            square = _mean_square(scaled[:, None], 1 - (low + high) / 2).average
-            factors[name] = Average(
-                float(np.sqrt(square.value / ((low + high) / 2))),
-                float(np.sqrt(square.low / high)),
-                float(np.sqrt(square.high / low)) if low > 0 else np.inf,
-            )
-    sigma = np.full_like(error, np.nan)
-    variance = np.diagonal(claims.cov, axis1=1, axis2=2)
-    for name in ("position", "heading"):
-        ok = claims.valid[name]
-        sigma[ok, _AXES[name]] = np.sqrt(variance[ok, _AXES[name]])
-    compared = error[is_compared]
+            factors[name] = _sigma_factor(aligned, k, valid)
+    lag, note = _clock_lag(rows, claims, align, is_compared, judged)
+
+    # What qualifies them.
     doubts = list(aligned.notes)
     if align == "none":
-        doubts += _frames_note(pose[is_compared], true[is_compared])
+        doubts += _doubt_on_frames(errors.pose, errors.truth)
     if cov is None:
         doubts.append("the estimate has no covariance: its errors alone are measured")
     elif not blocks:
         doubts.append("no covariance can be judged")
-    lag, note = _lag(rows, claims, align, is_compared, judged)
     doubts += [note] * bool(note)
     return RecordingScores(
-        verdict=_word(blocks, int(is_compared.sum())),
-        errors=RecordedErrors(
-            time[is_compared],
-            compared,
-            sigma[is_compared],
-            pose[is_compared],
-            aligned.truth[is_compared],
-        ),
-        rmse=dict(zip(COMPONENTS, np.sqrt((compared**2).mean(axis=0)).tolist(), strict=True)),
-        mean={name: _mean(compared[:, k]) for k, name in enumerate(COMPONENTS)},
+        verdict=_verdict(blocks, int(is_compared.sum())),
+        errors=errors,
+        rmse=dict(zip(COMPONENTS, np.sqrt((errors.error**2).mean(axis=0)).tolist(), strict=True)),
+        mean={name: mean_of(errors.error[:, k]) for k, name in enumerate(COMPONENTS)},
         blocks=blocks,
         factors=factors,
         lag=lag,
-        dropped=dropped,
+        dropped={reason: int(mask.sum()) for reason, mask in left_out.items() if mask.any()},
         doubts=tuple(doubts),
     )
 
@@ -359,7 +323,7 @@ def _stamped_poses(
     return time, pose
 
 
-def _frames_note(pose: Float[np.ndarray, "n 3"], truth: Float[np.ndarray, "n 3"]) -> list[str]:
+def _doubt_on_frames(pose: Float[np.ndarray, "n 3"], truth: Float[np.ndarray, "n 3"]) -> list[str]:
     """A sentence where nearly all of the position errors are one rigid motion, as of two frames."""
     if not np.ptp(truth[:, :2], axis=0).any():  # positions show no turn
         return []
@@ -376,388 +340,27 @@ def _frames_note(pose: Float[np.ndarray, "n 3"], truth: Float[np.ndarray, "n 3"]
     ]
 
 
-class _Rows(NamedTuple):
-    """The times and poses of an estimate, and the path of the truth with its times."""
-
-    time: Float[np.ndarray, "n"]
-    pose: Float[np.ndarray, "n 3"]
-    clock: Float[np.ndarray, "m"]
-    path: Float[np.ndarray, "m 3"]
-    longest_gap: float | None
-
-    def truth(self, shift: float = 0.0) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, "n"]]:
-        """The truth at the times of the estimate less a shift [s], and where it is known; elsewhere
-        the estimate, so that sums over masked rows stay finite."""
-        at = self.time - shift
-        path, is_known = known_poses(self.clock, self.path, at, self.longest_gap, geodesic_poses)
-        return np.where(is_known[:, None], path, self.pose), is_known
-
-    def velocity(self, shift: float) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, "n"]]:
-        """The velocity of the truth at the times less a shift, in its own axes: of the estimate's
-        its noise would be a part."""
-        half = max(_HALF, float(np.median(np.diff(self.clock))) if len(self.clock) > 1 else _HALF)
-        before, in_time = self.truth(shift + half)
-        after, still_in_time = self.truth(shift - half)
-        moved = np.column_stack([after[:, :2] - before[:, :2], wrapped(after[:, 2] - before[:, 2])])
-        return _in_axes(self.truth(shift)[0], moved) / (2 * half), in_time & still_in_time
-
-
-def _in_axes(
-    pose: Float[np.ndarray, "n 3"], vector: Float[np.ndarray, "n 3"]
-) -> Float[np.ndarray, "n 3"]:
-    """Vectors (x, y, θ) of the world in the axes of poses: along, across, heading."""
-    c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
-    x, y, turn = vector.T
-    return np.column_stack([c * x + s * y, c * y - s * x, turn])
-
-
-def _error(
-    pose: Float[np.ndarray, "n 3"], truth: Float[np.ndarray, "n 3"]
-) -> Float[np.ndarray, "n 3"]:
-    """Truth minus estimate, along, across and in heading."""
-    gap = truth - pose
-    return _in_axes(pose, np.column_stack([gap[:, :2], wrapped(gap[:, 2])]))
-
-
-class _Claims(NamedTuple):
-    """The claimed covariances in the axes of the estimate, and which of them can be judged."""
-
-    cov: Float[np.ndarray, "n 3 3"]
-    """unit matrices where not valid"""
-    valid: dict[str, Bool[np.ndarray, "n"]]
-    """by block of `DOF`"""
-    faults: dict[str, Bool[np.ndarray, "n"]]
-    """poses by what is wrong with their covariance"""
-    turn: Float[np.ndarray, "n 3 3"]
-    """matrices that turn (x, y, θ) of the world into the axes of the estimate"""
-
-    @classmethod
-    def of(
-        cls,
-        cov: Float[np.ndarray, "n 3 3"] | None,
-        pose: Float[np.ndarray, "n 3"],
-        frame: str,
-    ) -> "_Claims":
-        """The claims of covariances, None for none, in the axes of the frame."""
-        count = len(pose)
-        turn = np.stack([_in_axes(pose, np.tile(axis, (count, 1))) for axis in np.eye(3)], axis=2)
-        unit = np.tile(np.eye(3), (count, 1, 1))
-        if cov is None:
-            return cls(unit, {name: np.zeros(count, bool) for name in DOF}, {}, turn)
-        is_unknown = cov[:, 0, 0] == -1
-        faults_by_block: dict[str, dict[str, np.ndarray]] = {}
-        valid = {}
-        for name, axes in _AXES.items():
-            block = cov[:, axes, axes]
-            finite = np.isfinite(block).all(axis=(1, 2))
-            safe = np.where(finite[:, None, None], block, 0.0)
-            variance = np.diagonal(safe, axis1=1, axis2=2)
-            tests = {
-                "-1 first, unknown": is_unknown,
-                "not finite": ~finite,
-                "zero": (safe == 0).all(axis=(1, 2)),
-                f"above {LARGEST:g}": (variance > LARGEST).any(axis=1),
-                "not symmetric": is_asymmetric(safe, 1e-6),  # of float32
-                "singular, or not positive definite": ~is_invertible(safe),
-            }
-            # A pose has one fault: of several the first.
-            sound = np.ones(count, bool)
-            faults_by_block[name] = {}
-            for fault, fails in tests.items():
-                faults_by_block[name][fault] = sound & fails
-                sound = sound & ~fails
-            rest = block[sound]
-            is_constant = len(rest) > 1 and bool((rest == rest[:1]).all())
-            faults_by_block[name]["constant from beginning to end"] = sound & is_constant
-            valid[name] = sound & (not is_constant)
-        valid["pose"] &= valid["position"] & valid["heading"]
-        faults = {}
-        for fault, position in faults_by_block["position"].items():
-            heading = faults_by_block["heading"][fault]
-            both = position & heading
-            faults[f"covariance {fault}"] = both
-            faults[f"covariance of the position {fault}"] = position & ~both
-            faults[f"variance of the heading {fault}"] = heading & ~both
-        apart = valid["position"] & valid["heading"] & ~valid["pose"]
-        faults["covariance of position and heading singular together"] = apart
-        usable = valid["position"] | valid["heading"]
-        safe = np.where(usable[:, None, None], np.nan_to_num(cov), unit)
-        safe = (safe + np.swapaxes(safe, 1, 2)) / 2
-        if frame == "world":
-            safe = turn @ safe @ np.swapaxes(turn, 1, 2)
-        # A block without the other: nothing of the other enters.
-        safe[~valid["position"], :2] = safe[~valid["position"], :, :2] = 0.0
-        safe[~valid["heading"], 2] = safe[~valid["heading"], :, 2] = 0.0
-        for name in ("position", "heading"):
-            for k in range(3)[_AXES[name]]:
-                safe[~valid[name], k, k] = 1.0
-        return cls(safe, valid, faults, turn)
-
-    def weight(self, part: str | int, valid: Bool[np.ndarray, "n"]) -> Float[np.ndarray, "n 3 3"]:
-        """M of eᵀ M e, the square of a block of the error, or of component k; 0 if not valid."""
-        axes = _AXES[part] if isinstance(part, str) else slice(part, part + 1)
-        weight = np.zeros_like(self.cov)
-        weight[:, axes, axes] = np.linalg.inv(self.cov[:, axes, axes])
-        return np.where(valid[:, None, None], weight, 0.0)
-
-
-class _Alignment(NamedTuple):
-    """The truth in the frame of the estimate, and what carrying it there does to honest NEES."""
-
-    truth: Float[np.ndarray, "n 3"]
-    notes: tuple[str, ...]
-    claims: _Claims
-    lever: Float[np.ndarray, "n 3 3"]
-    """J: change of each error by a small motion of the truth"""
-    start_cov: Float[np.ndarray, "3 3"]
-    """covariance of that motion by the first error; zeros unless aligned there"""
-    weight: Float[np.ndarray, "n 3 3"]
-    """P⁻¹ of the poses that have determined the best motion, else zeros"""
-    error: Float[np.ndarray, "n 3"]
-
-    @classmethod
-    def of(
-        cls,
-        align: str,
-        claims: _Claims,
-        pose: Float[np.ndarray, "n 3"],
-        truth: Float[np.ndarray, "n 3"],
-        is_known: Bool[np.ndarray, "n"],
-    ) -> "_Alignment":
-        """The truth carried as `align` says, by the poses at which it is known."""
-        turn = claims.turn
-        frame, centre = np.zeros(3), np.zeros(3)
-        notes: tuple[str, ...] = ()
-        start_cov, weight = np.zeros((3, 3)), np.zeros_like(turn)
-        start = int(np.argmax(is_known))
-        if align == "first":
-            frame, centre = compose(pose[start], inverse(truth[start])), pose[start]
-            notes = ("aligned at the first pose: its error is in all of the others",)
-            if claims.valid["pose"][start]:
-                start_cov = turn[start].T @ claims.cov[start] @ turn[start]
-            elif claims.valid["pose"].any() and not claims.faults["covariance zero"][start]:
-                notes += ("the first pose has no valid covariance: honest values leave it out",)
-        elif align == "best":
-            usable = is_known & claims.valid["pose"]
-            if usable.any():
-                weight = claims.weight("pose", usable)
-                fit = weight
-            else:
-                usable = is_known
-                fit = np.where(usable[:, None, None], np.eye(3), 0.0)
-            frame = compose(pose[start], inverse(truth[start]))
-            if np.ptp(truth[usable, :2], axis=0).any():  # else positions show no turn
-                frame = alignment(truth[usable, :2], pose[usable, :2])
-            for _ in range(_STEPS):
-                carried = compose(frame, truth)
-                centre = carried[usable].mean(axis=0)
-                lever = _lever(turn, carried, centre)
-                curvature, gradient = _normal_equations(lever, fit, _error(pose, carried))
-                x, y, angle = -np.linalg.solve(curvature, gradient.sum(axis=0))
-                moved = np.array([centre[0] + x, centre[1] + y, angle])
-                about = np.array([-centre[0], -centre[1], 0.0])
-                frame = compose(moved, compose(about, frame))
-                if max(abs(x), abs(y), abs(angle)) < _SHORTEST:
-                    break
-            notes = (
-                "aligned by the best rigid motion, which takes 3 degrees of freedom: an error that "
-                "all poses have in common cannot be seen",
-            )
-        carried = compose(frame, truth)
-        lever = _lever(turn, carried, centre)
-        return cls(carried, notes, claims, lever, start_cov, weight, _error(pose, carried))
-
-    def honest(self, part: str | int, valid: Bool[np.ndarray, "n"]) -> tuple[float, float]:
-        """The range of an honest mean of eᵀ M e, of a block or a component k; see
-        `judge_recording`."""
-        dof = float(DOF[part]) if isinstance(part, str) else 1.0
-        if self.start_cov.any():
-            weight = self.claims.weight(part, valid)
-            carried = self.lever @ self.start_cov @ np.swapaxes(self.lever, 1, 2)
-            added = float(np.einsum("nij,nji->", weight, carried)) / max(valid.sum(), 1)
-            return max(dof - added, 0.0), dof + added
-        if not self.weight.any():
-            return dof, dof
-        # The errors before the motion are e + J a, a = A⁻¹ Σ Jᵀ W e. Their sum of squares has the
-        # expectation E Σ eᵀ M e + 2 E uᵀ a - E aᵀ B a, with u = Σ Jᵀ M (e + J a), B = Σ Jᵀ M J.
-        weight = self.claims.weight(part, valid)
-        curvature, s = _normal_equations(self.lever, self.weight, self.error)
-        block_curvature, u = _normal_equations(self.lever, weight, self.error)
-        used = self.weight.any(axis=(1, 2))
-        error = np.einsum("nji,nj->ni", self.claims.turn, self.error)  # in the axes of the world
-        error = np.where(used[:, None], error, 0.0)
-        size = np.sqrt((error**2).mean(axis=0))
-        length = _correlation_length(error / np.where(size > 0, size, 1.0))
-        # What is left has no mean, which takes a share 2K/n of its long-run covariance.
-        remains = max(1 - (2 * length - 1) / used.sum(), 0.5)
-        root = np.linalg.inv(curvature)
-        shared = root @ _long_run(s, s, length) @ root
-        removed = 2 * np.trace(_long_run(u, s, length) @ root) - np.trace(block_curvature @ shared)
-        removed /= remains
-        left = float(np.einsum("ni,nij,nj->", self.error, weight, self.error))
-        share = float(np.clip(removed / (left + removed), 0.0, 1.0)) if removed > 0 else 0.0
-        # What it takes is random, as it is of a few errors: from nothing to twice its expectation.
-        return dof * max(1 - 2 * share, 0.0), dof
-
-
-def _lever(
-    turn: Float[np.ndarray, "n 3 3"],
-    truth: Float[np.ndarray, "n 3"],
-    centre: Float[np.ndarray, "3"],
-) -> Float[np.ndarray, "n 3 3"]:
-    """J: the change of each error by a motion (x, y, θ) of the truth about a centre."""
-    motion = np.tile(np.eye(3), (len(truth), 1, 1))
-    motion[:, 0, 2], motion[:, 1, 2] = -(truth[:, 1] - centre[1]), truth[:, 0] - centre[0]
-    return turn @ motion
-
-
-def _normal_equations(
-    lever: Float[np.ndarray, "n 3 3"],
-    weight: Float[np.ndarray, "n 3 3"],
-    error: Float[np.ndarray, "n 3"],
-) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "n 3"]]:
-    """Σ Jᵀ W J, and Jᵀ W e of each pose."""
-    weighted = np.swapaxes(lever, 1, 2) @ weight
-    return (weighted @ lever).sum(axis=0), np.einsum("nij,nj->ni", weighted, error)
-
-
-def _products(
-    u: Float[np.ndarray, "n c"], s: Float[np.ndarray, "n d"]
-) -> Float[np.ndarray, "n c d"]:
-    """Σ_t u_t s_{t+k}ᵀ for each lag k from 0 to n - 1, by FFT."""
-    size = scipy.fft.next_fast_len(2 * len(u), real=True)
-    a, b = (scipy.fft.rfft(part, size, axis=0) for part in (u, s))
-    lags = scipy.fft.irfft(a.conj()[:, :, None] * b[:, None, :], size, axis=0)
-    return np.asarray(lags[: len(u)])
-
-
-def _correlation_length(z: Float[np.ndarray, "n d"]) -> int:
-    """The number of poses over which errors are correlated: the first lag with tr Σ z zᵀ <= 0."""
-    ends = np.trace(_products(z, z), axis1=1, axis2=2) <= 0
-    return int(np.argmax(ends)) if ends.any() else len(z)
-
-
-def _long_run(
-    u: Float[np.ndarray, "n c"], s: Float[np.ndarray, "n d"], length: int
-) -> Float[np.ndarray, "c d"]:
-    """The covariance of Σ u and Σ s: Σ_t u_t s_{t+k}ᵀ over lags |k| below a length."""
-    after, before = _products(u, s)[:length], _products(s, u)[1:length]
-    return np.asarray(after.sum(axis=0) + before.sum(axis=0).T)
-
-
-class _MeanSquare(NamedTuple):
-    """The mean q̄ of q = zᵀz over n poses, and how far its expectation may be away."""
-
-    average: Average
-    nu: float
-    """effective degrees of freedom: ν q̄/E q ~ χ²_ν"""
-    r: Float[np.ndarray, "K"]
-    """correlation of q_t and q_{t+k}, of Gaussian errors, from k = 0 to where it ends"""
-    excess: float
-    """variance of q̄ over that of Gaussian errors, and what its estimate adds to the interval"""
-
-
-def _mean_square(z: Float[np.ndarray, "n d"], absorbed: float = 0.0) -> _MeanSquare:
-    """The mean square of errors z that are correlated; see `judge_recording`.
-
-    absorbed: share of zᵀz that an alignment has taken from all of them alike, if above 0.
-    """
-    count, dof = z.shape
-    q = (z**2).sum(axis=1)
-    mean = float(q.mean())
-    if not mean > 0:
-        return _MeanSquare(Average(mean, 0.0, np.inf), 1.0, np.ones(1), 1.0)
-    before = mean / (1 - np.clip(absorbed, 0.0, 0.9))  # the alignment
-    products = _products(z, z) / count + (before - mean) / dof * np.eye(dof)
-    square = np.trace(products, axis1=1, axis2=2) ** 2
-    size = (products**2).sum(axis=(1, 2))
-    # The expectation of |C_k|² of errors that are independent at lag k, and correlated at the lags
-    # below it (Bartlett 1946)
-    noise = (2 * (np.cumsum(square) - square) - square[0]) / count
-    noise[0] = 0.0
-    is_noise = size <= noise
-    length = int(np.argmax(is_noise)) if is_noise.any() else count
-    # Without that noise of its d² entries |C_k|² is at least (tr C_k)²/d, by Cauchy and Schwarz.
-    size = np.maximum(size[:length] - noise[length - 1], square[:length] / dof)
-    size[0] = (products[0] ** 2).sum()
-    gaussian = 2 * float(size[0] + 2 * size[1:].sum())
-    centred = (q - mean)[:, None]
-    excess = max(1.0, float(_long_run(centred, centred, length)[0, 0]) / count / gaussian)
-    nu = float(np.clip(2 * count * before**2 / (excess * gaussian), 1.0, count * dof))
-    # Of n/2K stretches; Student's t in place of the normal
-    half = t_quantile((1 + LEVEL) / 2, max(count / (2 * length), 1.0))
-    shrunk = (normal_quantile((1 + LEVEL) / 2) / half) ** 2
-    fewer = max(nu * shrunk, 1.0)
-    low, high = (fewer * mean / chi2_quantile(p, fewer) for p in ((1 + LEVEL) / 2, (1 - LEVEL) / 2))
-    return _MeanSquare(Average(mean, low, high), nu, size / size[0], excess / shrunk)
-
-
-def _share(inside: Bool[np.ndarray, "n"], level: float, dof: int, nees: _MeanSquare) -> Average:
-    """The share of poses within an ellipsoid of a level, with its interval of Jeffreys.
-
-    Two χ²_d numbers with correlation r have the joint density f f' Σ_m r^m L_m L_m', with L_m the
-    normalized polynomials of Laguerre (Kibble 1941, "A two-variate gamma type distribution",
-    Sankhyā 5). So the indicators of q <= χ²_d(p) have the correlation Σ_m w_m r^m, w_m the share of
-    their variance of order m, and as many independent ones have the same spread.
-    """
-    c, a = chi2_quantile(level, dof) / 2, dof / 2
-    m = np.arange(1, _ORDERS + 1)
-    gammaln = scipy.special.gammaln
-    # ∫ f L_m over [0, c], and the square of the norm of L_m
-    integral = np.exp(a * np.log(c) - c - gammaln(a)) / m
-    integral *= scipy.special.eval_genlaguerre(m - 1, a, c)
-    norm = np.exp(gammaln(m + a) - gammaln(m + 1) - gammaln(a))
-    weight = integral**2 / norm / (level * (1 - level))
-    sums = np.array([(nees.r[1:] ** order).sum() for order in m])
-    independent = max(len(inside) / (1 + 2 * float(weight @ sums)) / nees.excess, 1.0)
-    share = float(inside.mean())
-    shape = independent * share + 0.5, independent * (1 - share) + 0.5
-    low, high = (
-        float(scipy.special.betaincinv(*shape, p)) for p in ((1 - LEVEL) / 2, (1 + LEVEL) / 2)
-    )
-    # Of none or all, the end that is sure (Brown, Cai & DasGupta 2001).
-    return Average(share, low if share > 0 else 0.0, high if share < 1 else 1.0)
-
-
-def _mean(values: Float[np.ndarray, "n"]) -> Average:
-    """The mean of correlated numbers with its t interval."""
-    mean = float(values.mean())
-    error, dof = _error_of_sum((values - mean)[:, None])
-    half = t_quantile(0.5 + LEVEL / 2, dof) * error / len(values)
-    return Average(mean, mean - half, mean + half)
-
-
-def _error_of_sum(scores: Float[np.ndarray, "n 1"]) -> tuple[float, float]:
-    """The standard error of a sum of correlated numbers of mean 0, and its degrees of freedom."""
-    total = float((scores**2).sum())
-    if not total > 0:
-        return 0.0, 1.0
-    length = _correlation_length(scores)
-    long_run = max(float(_long_run(scores, scores, length)[0, 0]), total)
-    return float(np.sqrt(long_run)), max(len(scores) / (2 * length), 1.0)
-
-
 def _blocks(
-    aligned: _Alignment, judged: Mapping[str, Bool[np.ndarray, "n"]]
+    aligned: Alignment, judged: Mapping[str, Bool[np.ndarray, "n"]]
 ) -> dict[str, RecordedBlock]:
     """The scores of each block that has two poses, at the poses where it is judged."""
     blocks = {}
     for name, valid in judged.items():
         if valid.sum() < 2:
             continue
-        axes, dof = _AXES[name], DOF[name]
+        axes, dof = AXES[name], DOF[name]
         # In the axes of the world, where an error that stays does not turn with the robot
         turn = aligned.claims.turn[valid]
         cov = np.swapaxes(turn, 1, 2) @ aligned.claims.cov[valid] @ turn
         error = np.swapaxes(turn, 1, 2) @ aligned.error[valid, :, None]
         z = np.linalg.solve(np.linalg.cholesky(cov[:, axes, axes]), error[:, axes])[..., 0]
         honest = aligned.honest(name, valid)
-        nees = _mean_square(z, 1 - sum(honest) / (2 * dof))
+        nees = mean_square(z, 1 - sum(honest) / (2 * dof))
         square = (z**2).sum(axis=1)
         coverage, honest_coverage = {}, {}
         for level in LEVELS:
             bound = chi2_quantile(level, dof)
-            coverage[level] = _share(square <= bound, level, dof, nees)
+            coverage[level] = share_within(square <= bound, level, dof, nees)
             # Of errors whose NEES is honest/dof times χ²
             low, high = (
                 float(scipy.special.gammainc(dof / 2, bound * dof / end / 2)) if end > 0 else 1.0
@@ -770,7 +373,24 @@ def _blocks(
     return blocks
 
 
-def _word(blocks: Mapping[str, RecordedBlock], compared: int) -> str:
+def _sigma_factor(aligned: Alignment, k: int, valid: Bool[np.ndarray, "n"]) -> Average:
+    """√(mean (e_k/σ_k)²): the factor by which the claimed σ of component k is too small.
+
+    An alignment makes the honest mean square of e_k/σ_k a range: the interval is as wide as that
+    range has it, and the value is beside its middle.
+    """
+    scaled = aligned.error[valid, k] / np.sqrt(aligned.claims.cov[valid, k, k])
+    low, high = aligned.honest(k, valid)
+    honest = (low + high) / 2
+    square = mean_square(scaled[:, None], 1 - honest).average
+    return Average(
+        float(np.sqrt(square.value / honest)),
+        float(np.sqrt(square.low / high)),
+        float(np.sqrt(square.high / low)) if low > 0 else np.inf,
+    )
+
+
+def _verdict(blocks: Mapping[str, RecordedBlock], compared: int) -> str:
     """The verdict by the first block that is judged, of so many poses that are compared."""
     if not blocks:
         return "incomplete"
@@ -786,20 +406,25 @@ def _word(blocks: Mapping[str, RecordedBlock], compared: int) -> str:
     return "consistent" if nees.low > nees.value / 2 else "undecided"
 
 
-def _lag(
-    rows: _Rows,
-    claims: _Claims,
+def _clock_lag(
+    rows: Rows,
+    claims: Claims,
     align: str,
     is_compared: Bool[np.ndarray, "n"],
     judged: Mapping[str, Bool[np.ndarray, "n"]],
 ) -> tuple[ClockLag | None, str]:
-    """The lag of the estimate, and a note on it or on why there is none."""
+    """The δ of e_t = δ ξ_t + b by least squares, and a sentence on it or on why there is none.
+
+    Centring e and ξ removes b, so δ = Σ ξᵀ W e / Σ ξᵀ W ξ. The truth is shifted by δ, and the fit
+    repeated, since ξ and the frame change along a curve.
+    """
     lag = 0.0
-    for _ in range(_STEPS):
+    for _ in range(STEPS):
         truth, is_known = rows.truth(lag)
-        aligned = _Alignment.of(align, claims, rows.pose, truth, is_known)
+        aligned = Alignment.of(align, claims, rows.pose, truth, is_known)
         velocity, moves = rows.velocity(lag)
         kept = is_compared & is_known & moves
+        # A lag of half of the recording is no lag: what is left then decides nothing.
         if kept.sum() < 3 or 2 * kept.sum() < is_compared.sum():
             return None, "no lag: too few poses at which the velocity of the truth is known"
         error, velocity = aligned.error[kept], velocity[kept]
@@ -812,25 +437,28 @@ def _lag(
             return None, "no lag: the velocity is constant, and a lag is like an offset then"
         step = float((change * weight * error).sum()) / information
         lag += step
-        if abs(step) < _SHORTEST:
+        if abs(step) < SHORTEST:
             break
+
     residual = error - step * change
-    spread, dof = _error_of_sum((change * weight * residual).sum(axis=1, keepdims=True))
+    spread, dof = error_of_sum((change * weight * residual).sum(axis=1, keepdims=True))
     deviation = spread / information
     half = t_quantile(0.5 + LEVEL / 2, dof) * deviation
+
+    # The NEES of the errors that the truth, shifted by the lag, leaves.
     truth, is_known = rows.truth(lag)
-    aligned = _Alignment.of(align, claims, rows.pose, truth, is_known)
+    aligned = Alignment.of(align, claims, rows.pose, truth, is_known)
     blocks = _blocks(aligned, {name: valid & is_known for name, valid in judged.items()})
-    without = _word(blocks, int((is_compared & is_known).sum()))
+    nees = {name: block.nees for name, block in blocks.items()}
+    verdict = _verdict(blocks, int((is_compared & is_known).sum()))
     note = ""
     if abs(lag) > half and blocks:
-        nees = next(iter(blocks.values())).nees.value
         note = (
             f"the estimate is {abs(1e3 * lag):.3g} ms {'behind' if lag > 0 else 'ahead of'} the "
-            f"truth; without that lag the NEES is {nees:.3g}, and the verdict {without}"
+            f"truth; without that lag the NEES is {next(iter(nees.values())).value:.3g}, and the "
+            f"verdict {verdict}"
         )
-    nees_by_block = {name: block.nees for name, block in blocks.items()}
-    return ClockLag(Average(lag, lag - half, lag + half), deviation, nees_by_block, without), note
+    return ClockLag(Average(lag, lag - half, lag + half), deviation, nees, verdict), note
 
 
 def _text(average: Average, scale: float = 1.0) -> str:

@@ -124,13 +124,61 @@ def score(
     )
 
 
+class _White(NamedTuple):
+    """Whitened innovations w, by landmark, or by measurement slot without a map; (N,) each."""
+
+    w: list[Array]
+    """its numbers; 0 where there is none"""
+    square: Array
+    """|w|²"""
+    valid: Array
+    """1 where there is one, else 0"""
+
+
+class _Pairs(NamedTuple):
+    """Sums over the pairs of a landmark's whitened innovations w and, steps later, w'; (LAGS, N)
+    each. v is 1 where there is one, else 0."""
+
+    product: Array
+    """Σ wᵀw'"""
+    earlier: Array
+    """Σ |w|² v'"""
+    later: Array
+    """Σ v |w'|²"""
+    number: Array
+    """Σ v v'"""
+
+    @classmethod
+    def of(cls, before: _White, now: _White) -> "_Pairs":
+        """The products of a step with those before it. before: (LAGS, N), now: (N,)."""
+        product = jnp.zeros_like(before.square)
+        if now.w:
+            product = linalg.total(
+                w * w_now[None] for w, w_now in zip(before.w, now.w, strict=True)
+            )
+        return cls(
+            product=product,
+            earlier=before.square * now.valid[None],
+            later=before.valid * now.square[None],
+            number=before.valid * now.valid[None],
+        )
+
+    def autocorrelation(self, size: int) -> Float[Array, "LAGS 3"]:
+        """Σ wᵀw', √(Σ|w|² Σ|w'|²), over which that is the correlation, and the pairs of numbers, by
+        lag. size: of w."""
+        product, earlier, later, number = (values.sum(axis=1) for values in self)
+        squares = earlier * later
+        is_pair = squares > 0
+        length = jnp.where(is_pair, jnp.sqrt(jnp.where(is_pair, squares, 1.0)), 0.0)
+        return jnp.stack([product, length, number * size], axis=1)
+
+
 class _Sums(NamedTuple):
     poison: Array
     """() 0 times every earlier number: NaN once one was not finite"""
-    recent: list[Array]
-    """(LAGS, N) each, the latest steps first: the numbers of w, |w|² and a mask of the values"""
-    pairs: list[Array]
-    """(LAGS, N) each: Σ wᵀw', |w|² v', v |w'|², v v', with v the mask of the values"""
+    recent: _White
+    """(LAGS, N) each, the latest steps first"""
+    pairs: _Pairs
 
 
 def run_statistics(
@@ -142,6 +190,10 @@ def run_statistics(
     number nor one a step.
     """
     estimate, info = trace.estimate, trace.info
+    dtype, steps = estimate.pose.dtype, len(estimate.pose)
+    points = jax.vmap(sensor.position)(jnp.asarray(truth.landmarks))
+
+    # The true landmark of each one in the map, -1 of none; and the values of measures.
     held = jnp.where(estimate.alive, estimate.tag, -1)
     values: dict[str, Array | tuple[Array, Array]] = {}
     if truth.origin is not None:
@@ -151,65 +203,50 @@ def run_statistics(
     for measure in measures:
         if measure.of_run is None:
             continue
-        value = jnp.asarray(measure.of_run(truth, trace), estimate.pose.dtype)
-        steps = len(estimate.pose)
+        value = jnp.asarray(measure.of_run(truth, trace), dtype)
         if value.shape not in ((), (steps,)):
             raise ValueError(
                 f"measure {measure.key}: expected of_run to return a number or one for each of the "
                 f"{steps} steps, got an array of shape {value.shape}"
             )
         values[measure.key] = value
-    points = jax.vmap(sensor.position)(jnp.asarray(truth.landmarks))
-    size, count = info.innovation.shape[2], estimate.alive.shape[1] or info.slot.shape[1]
-    dtype = estimate.pose.dtype
 
+    # One scan for the rest, which looks at one map at a time, not at T.
     def step(sums: _Sums, row: tuple[Estimate, Info, Array]) -> tuple[_Sums, PyTree]:
         estimate, info, held = row
-        off = points[jnp.maximum(held, 0)] - estimate.points
-        nees, regular = _planar_nees(off, jnp.asarray(estimate.point_covs))
+        error = points[jnp.maximum(held, 0)] - estimate.points
+        nees, regular = _planar_nees(error, jnp.asarray(estimate.point_covs))
         counts = regular & (held >= 0)
-        white = _white(estimate, info)
-        *w, energy, valid = sums.recent
-        *w_now, energy_now, valid_now = white
-        products = [
-            linalg.total(old * new[None] for old, new in zip(w, w_now, strict=True))
-            if size
-            else jnp.zeros_like(energy),
-            energy * valid_now[None],
-            valid * energy_now[None],
-            valid * valid_now[None],
-        ]
+        before, now = sums.recent, _whitened(estimate, info)
         sums = _Sums(
+            # 0 · x is NaN where x is not finite, and stays so in the sum.
             poison=sums.poison + 0 * _numbers((estimate, info)),
-            recent=[
-                jnp.concatenate([new[None], old[:-1]])
-                for new, old in zip(white, sums.recent, strict=True)
-            ],
-            pairs=[old + new for old, new in zip(sums.pairs, products, strict=True)],
+            recent=jax.tree.map(
+                lambda old, new: jnp.concatenate([new[None], old[:-1]]), before, now
+            ),
+            pairs=jax.tree.map(jnp.add, sums.pairs, _Pairs.of(before, now)),
         )
         return sums, (jnp.where(counts, nees, 0.0).sum(), counts.sum().astype(dtype))
 
-    first = jax.tree.map(lambda leaf: leaf[0], (estimate, info))
+    size, count = info.innovation.shape[2], estimate.alive.shape[1] or info.slot.shape[1]
+    zeros = jnp.zeros((LAGS, count), dtype)
     nothing = _Sums(
-        poison=jnp.zeros_like(_numbers(first)),
-        recent=[jnp.zeros((LAGS, count), dtype)] * (size + 2),
-        pairs=[jnp.zeros((LAGS, count), dtype)] * 4,
+        poison=jnp.zeros_like(_numbers(jax.tree.map(lambda leaf: leaf[0], (estimate, info)))),
+        recent=_White([zeros] * size, zeros, zeros),
+        pairs=_Pairs(zeros, zeros, zeros, zeros),
     )
     sums, (nees, regular) = jax.lax.scan(step, nothing, (estimate, info, held))
-    product, left, right, pairs = (pair.sum(axis=1) for pair in sums.pairs)
-    # √(Σ|w|² Σ|w'|²) by lag, over which Σ wᵀw' is the correlation; 0 without a pair.
-    both = left * right
-    length = jnp.where(both > 0, jnp.sqrt(jnp.where(both > 0, both, 1.0)), 0.0)
-    # The map at the end.
-    named = (held[-1] >= 0) & (estimate.point_covs[-1] != 0).any()  # a known map has no errors
-    off = points[jnp.maximum(held[-1], 0)] - estimate.points[-1]
-    square = jnp.where(named, (off**2).sum(axis=-1), 0.0).sum()
+
+    # The map at the end; a known one has no errors.
+    is_judged = (held[-1] >= 0) & (estimate.point_covs[-1] != 0).any()
+    error = points[jnp.maximum(held[-1], 0)] - estimate.points[-1]
+    square = jnp.where(is_judged, (error**2).sum(axis=-1), 0.0).sum()
     return RunStatistics(
         finite=jnp.isfinite(sums.poison).all(),
         landmark_nees=nees,
         regular_landmarks=regular,
-        landmark_squares=jnp.stack([square, named.sum().astype(dtype)]),
-        autocorrelation=jnp.stack([product, length, pairs * size], axis=1),
+        landmark_squares=jnp.stack([square, is_judged.sum().astype(dtype)]),
+        autocorrelation=sums.pairs.autocorrelation(size),
         values=values,
     )
 
@@ -241,8 +278,8 @@ def _planar_nees(
     return jnp.where(regular, nees, 0.0), regular
 
 
-def _white(estimate: Estimate, info: Info) -> list[Array]:
-    """The numbers of the whitened innovation w, |w|², and 1 where there is one, else 0; (N,) each.
+def _whitened(estimate: Estimate, info: Info) -> _White:
+    """L⁻¹ν, with S = L Lᵀ, of the measurements that are fused.
 
     By landmark, of the first measurement fused with it; by measurement slot without a map.
     """
@@ -251,20 +288,22 @@ def _white(estimate: Estimate, info: Info) -> list[Array]:
     def whiten(nu: Array, cov: Array) -> Array:
         return linalg.solve_lower(linalg.cholesky(cov)[0], nu)
 
-    white = jax.vmap(whiten)(info.innovation, info.innovation_cov)
-    white = jnp.where(fused[:, None], white, 0.0)
-    rows = [*white.T, (white**2).sum(axis=1), fused.astype(white.dtype)]
+    w = jax.vmap(whiten)(info.innovation, info.innovation_cov)
+    w = jnp.where(fused[:, None], w, 0.0)
+    by_measurement = _White([*w.T], (w**2).sum(axis=1), fused.astype(w.dtype))
     count = estimate.alive.shape[0]
     if count == 0:
-        return rows
+        return by_measurement
     slot = jnp.where(fused, info.slot, -1)
 
-    def place(kept: list[Array], at: tuple[list[Array], Array]) -> tuple[PyTree, None]:
-        row, slot = at
+    def place(kept: _White, measurement: tuple[_White, Array]) -> tuple[_White, None]:
+        white, slot = measurement
         is_slot = jnp.arange(count, dtype=slot.dtype) == slot
-        return [jnp.where(is_slot, new, old) for new, old in zip(row, kept, strict=True)], None
+        return jax.tree.map(lambda new, old: jnp.where(is_slot, new, old), white, kept), None
 
-    nothing = [jnp.zeros(count, white.dtype)] * len(rows)
+    nothing = jax.tree.map(lambda _: jnp.zeros(count, w.dtype), by_measurement)
     # In reverse, so that the first measurement of a landmark is written last, and stays.
     unroll = max(min(len(slot), _UNROLLED), 1)
-    return jax.lax.scan(place, nothing, (rows, slot), reverse=True, unroll=unroll)[0]
+    scan = jax.lax.scan(place, nothing, (by_measurement, slot), reverse=True, unroll=unroll)
+    by_landmark: _White = scan[0]
+    return by_landmark

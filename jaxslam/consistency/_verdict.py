@@ -128,7 +128,7 @@ def judge(
         word = "incomplete"
     elif by:
         word = "pessimistic"
-    elif _is_starved(counts):
+    elif _Measured.of(counts).is_starved:
         word = "incomplete"
     else:
         word = "undecided" if is_wide else "consistent"
@@ -172,6 +172,25 @@ class _Measured(NamedTuple):
     """counts by reason"""
     missed: int
     """landmarks in view that have no measurement in the log"""
+    nothing: bool
+    """whether the logs are known to have no measurement"""
+    fused: int
+    """fused measurements, 0 where those of the logs are not counted"""
+
+    @classmethod
+    def of(cls, counts: Mapping[str, int]) -> "_Measured":
+        """The fate of the measurements by the counts of a campaign."""
+        dropped = {name: counts.get(name, 0) for name in map(_name, DROPS)}
+        used = sum(counts.get(name, 0) for name in map(_name, KEPT))
+        with_status = used + sum(dropped.values())
+        return cls(
+            total=max(counts.get("measured", 0), with_status),
+            used=used,
+            dropped=dropped,
+            missed=counts.get("missed", 0),
+            nothing=counts.get("measured") == 0,
+            fused=counts.get("fused", 0) if "measured" in counts else 0,
+        )
 
     @property
     def uses_none(self) -> bool:
@@ -179,23 +198,57 @@ class _Measured(NamedTuple):
         has a status."""
         return not self.used and sum(self.dropped.values()) == self.dropped["unmatched"]
 
+    @property
+    def is_starved(self) -> bool:
+        """Whether nothing was measured, or over half was not used, or had no place in the scan."""
+        if self.nothing:
+            return True
+        if self.uses_none:
+            return False
+        return self.total > 2 * self.used or self.missed > self.total
 
-def _measured(counts: Mapping[str, int]) -> _Measured:
-    dropped = {name: counts.get(name, 0) for name in map(_name, DROPS)}
-    used = sum(counts.get(name, 0) for name in map(_name, KEPT))
-    with_status = used + sum(dropped.values())
-    total = max(counts.get("measured", 0), with_status)
-    return _Measured(total, used, dropped, counts.get("missed", 0))
-
-
-def _is_starved(counts: Mapping[str, int]) -> bool:
-    """Whether nothing was measured, or over half was not used, or had no place in the scan."""
-    measured = _measured(counts)
-    if counts.get("measured") == 0:
-        return True
-    if measured.uses_none:
-        return False
-    return measured.total > 2 * measured.used or measured.missed > measured.total
+    def doubts(self, nis_dof: float) -> list[str]:
+        """Sentences that qualify a verdict. nis_dof: sum of the degrees of freedom of NIS."""
+        doubts = list[str]()
+        if self.nothing:
+            doubts.append("nothing was measured in any run: only the motion was judged")
+        if self.missed:
+            doubts.append(
+                f"{self.missed:,} landmarks in view, beside {self.total:,} measured ones, had "
+                "no place in the scan: expected more places in the world"
+            )
+        if not self.total:
+            return doubts
+        ignored = self.total - self.used - sum(self.dropped.values())
+        if self.uses_none:
+            doubts.append(
+                f"takes none of the {self.total:,} measurements (by its Info): judged by the NEES "
+                "alone"
+            )
+        elif self.total > 2 * self.used:
+            reasons = [f"{count:,} {name}" for name, count in self.dropped.items() if count]
+            reasons += [f"{ignored:,} without a status in Info"] * bool(ignored)
+            doubts.append(
+                f"{self.total - self.used:,} of {self.total:,} measurements were "
+                f"{'not used' if ignored else 'dropped'}: {', '.join(reasons)}"
+            )
+        else:
+            if ignored:
+                doubts.append(
+                    f"{ignored:,} of {self.total:,} measurements have no status in Info: they may "
+                    "have been ignored"
+                )
+            if count := self.dropped["overflow"]:
+                doubts.append(
+                    f"{count:,} measurements of new landmarks found the map full: expected a "
+                    "larger capacity, or a filter that removes landmarks"
+                )
+            if self.fused and not nis_dof > 0:
+                doubts.append(
+                    f"{self.fused:,} fused measurements have no degrees of freedom in Info: no "
+                    "NIS, judged by the NEES alone"
+                )
+        return doubts
 
 
 def doubts_on(
@@ -241,7 +294,7 @@ def doubts_on(
             "ideal EKF"
         )
     if runs:
-        doubts += _doubts_on_measurements(counts, nis_dof)
+        doubts += _Measured.of(counts).doubts(nis_dof)
     free = np.asarray(per_run.get("unobservable", ()), np.float64)
     free = free[np.isfinite(free)]
     if free.size and free.mean() < 3:
@@ -252,49 +305,6 @@ def doubts_on(
             "ideal"
         )
     return tuple(doubts)
-
-
-def _doubts_on_measurements(counts: Mapping[str, int], nis_dof: float) -> list[str]:
-    measured, doubts = _measured(counts), list[str]()
-    if counts.get("measured") == 0:
-        doubts.append("nothing was measured in any run: only the motion was judged")
-    if measured.missed:
-        doubts.append(
-            f"{measured.missed:,} landmarks in view, beside {measured.total:,} measured ones, had "
-            "no place in the scan: expected more places in the world"
-        )
-    if not measured.total:
-        return doubts
-    ignored = measured.total - measured.used - sum(measured.dropped.values())
-    if measured.uses_none:
-        doubts.append(
-            f"takes none of the {measured.total:,} measurements (by its Info): judged by the NEES "
-            "alone"
-        )
-    elif measured.total > 2 * measured.used:
-        reasons = [f"{count:,} {name}" for name, count in measured.dropped.items() if count]
-        reasons += [f"{ignored:,} without a status in Info"] * bool(ignored)
-        doubts.append(
-            f"{measured.total - measured.used:,} of {measured.total:,} measurements were "
-            f"{'not used' if ignored else 'dropped'}: {', '.join(reasons)}"
-        )
-    else:
-        if ignored:
-            doubts.append(
-                f"{ignored:,} of {measured.total:,} measurements have no status in Info: they may "
-                "have been ignored"
-            )
-        if count := measured.dropped["overflow"]:
-            doubts.append(
-                f"{count:,} measurements of new landmarks found the map full: expected a larger "
-                "capacity, or a filter that removes landmarks"
-            )
-        if counts.get("fused", 0) and "measured" in counts and not nis_dof > 0:
-            doubts.append(
-                f"{counts['fused']:,} fused measurements have no degrees of freedom in Info: no "
-                "NIS, judged by the NEES alone"
-            )
-    return doubts
 
 
 def _name(status: Status) -> str:

@@ -2,6 +2,7 @@
 
 import math
 from numbers import Integral
+from typing import TypeGuard
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +14,7 @@ from jaxslam.math.stats import chi2_quantile
 __all__ = ["as_array", "gate_quantile", "is_concrete", "is_number", "is_whole", "largest"]
 
 
-def is_number(value: object) -> bool:
+def is_number(value: object) -> TypeGuard[int | float]:
     """Whether a value read from a file is a finite number."""
     try:
         return isinstance(value, int | float) and type(value) is not bool and math.isfinite(value)

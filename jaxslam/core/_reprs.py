@@ -24,7 +24,11 @@ def short_repr(record: PyTree) -> str:
 def text_of(value: PyTree) -> str:
     """A value as text: arrays by kind and shape, others as they are, cut to `_LONGEST`."""
     if hasattr(value, "shape") and hasattr(value, "dtype"):
-        if _is_number(value):
+        is_array = isinstance(value, np.ndarray | np.generic | jax.Array)
+        is_there = is_array and is_concrete(value)
+        if is_there and isinstance(value, jax.Array):
+            is_there = not value.is_deleted()
+        if is_there and value.shape == () and jnp.issubdtype(value.dtype, np.number):
             return str(jax.device_get(value))
         return f"{value.dtype}[{','.join(map(str, value.shape))}]"
     if hasattr(value, "_fields"):
@@ -36,13 +40,6 @@ def text_of(value: PyTree) -> str:
         return f"[{within}]" if isinstance(value, list) else f"({within})"
     text = repr(value)
     return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 1]}…"
-
-
-def _is_number(value: PyTree) -> bool:
-    """Whether an array is a number whose value is there."""
-    array = isinstance(value, np.ndarray | np.generic | jax.Array) and is_concrete(value)
-    deleted = isinstance(value, jax.Array) and array and value.is_deleted()
-    return array and not deleted and value.shape == () and jnp.issubdtype(value.dtype, np.number)
 
 
 def describe(value: object) -> str:

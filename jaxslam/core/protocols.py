@@ -428,11 +428,11 @@ class Sensor(Model):
         """Whether a landmark is a point (x, y), as some methods need."""
         return len(self.landmark) == 2 and self.carry is None
 
-    def carried(self, frame: Pose, landmark: Landmark) -> Landmark:
+    def move_landmark(self, frame: Pose, landmark: Landmark) -> Landmark:
         """A landmark given in a frame, in the coordinates that the frame's pose is in."""
         if self.carry is not None:
-            carried: Array = self.carry(frame, landmark)
-            return carried
+            moved: Array = self.carry(frame, landmark)
+            return moved
         if len(self.landmark) < 2:
             return landmark
         turns = np.array([name.endswith("[rad]") for name in self.landmark[2:]], bool)
@@ -591,8 +591,8 @@ class Linearizer(Component):
         """The new l, its derivative by the pose (L, 3), its covariance for a known pose (L, L)."""
         raise NotImplementedError
 
-    def born(self, joint: Joint, born: Bool[Array, "N"]) -> PyTree:
-        """The memory after the landmarks of the slots `born` entered the map."""
+    def remember(self, joint: Joint, new: Bool[Array, "N"]) -> PyTree:
+        """The memory after the landmarks of the slots `new` entered the map."""
         return joint.lin
 
 

@@ -8,7 +8,7 @@ estimates/0000/trajectory.csv, map.csv, innovations.csv     as `jaxslam run` wri
 import hashlib
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -27,12 +27,13 @@ from jaxslam.consistency.campaign._run_estimates import (
     RunFault,
     as_estimate,
 )
-from jaxslam.core.logs._tables import POSE, TAG, TIME, split_unit
+from jaxslam.core.logs._tables import POSE, TAG, TIME, label, split_unit
 from jaxslam.core.types import Log, Truth
 from jaxslam.core.validation import InvalidFile, refusals_of
-from jaxslam.datasets._landmark_logs.table_reader import MEASUREMENTS, ODOMETRY, CsvTable
-from jaxslam.datasets._landmark_logs.table_reader import MISSING as NO_NUMBER
-from jaxslam.datasets._lines import read_bytes, stored_file
+from jaxslam.datasets._csv import MISSING as NO_NUMBER
+from jaxslam.datasets._csv import CsvTable
+from jaxslam.datasets._landmark_logs.table_reader import MEASUREMENTS, ODOMETRY
+from jaxslam.datasets._lines import stored_file
 
 DRAWS, RUNS, TRUTH = "draws.json", "runs", "truth"
 """The file of settings, and the folders of logs and of truths, in a folder of draws."""
@@ -116,30 +117,31 @@ class TruthOfRun(NamedTuple):
     """The truth of a run, from its files."""
 
     time: Float[np.ndarray, "T"]
-    pose: Float[np.ndarray, "T 3"]
+    robot: Float[np.ndarray, "T R"]
+    """its pose, and what it has beside it"""
     tags: dict[int | str, int]
     """the row of each landmark, by its name"""
     odometry_time: Float[np.ndarray, "K"]
     """times of the lines of odometry, which need not be steps"""
 
 
-def read_truth(draws: Path, name: str, steps: int) -> TruthOfRun:
-    """The truth of the run with that name, of T steps.
+def read_truth(draws: Path, name: str, steps: int, state: Sequence[str] = POSE) -> TruthOfRun:
+    """The truth of the run with that name, of T steps. state: `Motion.state`.
 
     Raises ValueError, with file and line, where it cannot be read.
     """
     path = CsvTable(draws / TRUTH / name / "truth.csv")
-    columns = path.table((TIME, *POSE), "of the truth")
+    columns = path.columns((TIME, *state), "of the truth")
     if len(path.lines) != steps:
         reason = f"expected {steps} lines, as many as the run has steps, got {len(path.lines)}"
         raise InvalidFile(path.path, reason)
     tags: dict[int | str, int] = {}
     survey = draws / TRUTH / name / "landmarks.csv"
     if stored_file(survey) is not None:
-        names = CsvTable(survey).table((TAG,), "of landmarks").tags or ()
+        names = CsvTable(survey).columns((TAG,), "of landmarks").tags or ()
         tags = {tag: row for row, tag in enumerate(names) if tag is not None}
-    odometry = CsvTable(draws / RUNS / name / ODOMETRY).table((TIME,), "of odometry")
-    return TruthOfRun(columns.columns[TIME], columns.values(POSE), tags, odometry.columns[TIME])
+    odometry = CsvTable(draws / RUNS / name / ODOMETRY).columns((TIME,), "of odometry")
+    return TruthOfRun(columns.columns[TIME], columns.values(state), tags, odometry.columns[TIME])
 
 
 def folder_source(
@@ -148,25 +150,29 @@ def folder_source(
     measurements: Sequence[str],
     stride: int,
     failures: Mapping[int, RunFault],
+    state: Sequence[str] = POSE,
 ) -> Source:
     """The estimates in a folder, read run by run, as `judge_sources` takes them.
 
     Args:
         measurements: names of the numbers of a measurement, which are columns of a log.
         failures: of runs without an estimate, why there is none.
+        state: names of the numbers of the robot, the pose first.
     """
 
     def outcome_of(number: int, truth: Truth, log: Log) -> Outcome:
         name = run_name(number)
-        in_file = read_truth(draws.path, name, len(truth.pose))
-        gap = np.abs(in_file.pose - np.asarray(truth.pose, np.float64))
+        in_file = read_truth(draws.path, name, len(truth.pose), state)
+        gap = np.abs(in_file.robot - np.asarray(truth.robot, np.float64))
         gap[:, 2] = np.minimum(gap[:, 2], np.abs(2 * math.pi - gap[:, 2]))
         if not (largest := float(gap.max())) <= _SAME:
             path = draws.path / TRUTH / name / "truth.csv"
-            raise _draws_error(path, draws, f"poses that differ by {largest:.3g}")
+            raise _draws_error(path, draws, f"numbers that differ by {largest:.3g}")
         if number == 0:  # the other runs have the same key
             _check_log(draws, name, measurements, log)
-        truth = truth._replace(pose=in_file.pose)
+        truth = truth._replace(pose=in_file.robot[:, :3])
+        if truth.further is not None:
+            truth = truth._replace(further=in_file.robot[:, 3:])
         if number in failures:
             return Outcome(truth, None, failures[number])
         folder = estimates / name
@@ -175,7 +181,7 @@ def folder_source(
             reason = f"expected an estimate of {draws.path}, got one of other draws"
             raise InvalidFile(folder / PROGRAM, reason)
         size = int(np.shape(log.scan.z)[2])
-        result = read_estimate(folder, in_file, stride, size)
+        result = read_estimate(folder, in_file, stride, size, state[3:])
         if isinstance(result, RunFault):
             return Outcome(truth, None, result)
         return Outcome(truth, result, None, _seconds(origin))
@@ -189,7 +195,7 @@ def _check_log(draws: DrawsFolder, name: str, measurements: Sequence[str], log: 
     valid = np.asarray(log.scan.valid)
     if stored_file(path) is None or not valid.any():
         return
-    in_file = CsvTable(path).table(measurements, "of measurements").values(measurements)
+    in_file = CsvTable(path).columns(measurements, "of measurements").values(measurements)
     drawn = np.asarray(log.scan.z, np.float64)[valid]
     if in_file.shape != drawn.shape:
         raise _draws_error(path, draws, f"{len(in_file)} lines, where {len(drawn)} are drawn")
@@ -224,17 +230,18 @@ def _seconds(origin: Mapping[str, object]) -> float | None:
 
 
 def read_estimate(
-    folder: Path, truth: TruthOfRun, stride: int, size: int
+    folder: Path, truth: TruthOfRun, stride: int, size: int, further: Sequence[str] = ()
 ) -> RunEstimate | RunFault:
     """The estimate in a folder, at steps k, 2k, …, T, or why there is none; k is `stride`.
 
-    size: Z, of a measurement. Raises ValueError, with file and line, on what is not such a file.
+    size: Z, of a measurement. further: names of what the robot has beside its pose. Raises
+    ValueError, with file and line, on what is not such a file.
     """
     if stored_file(folder / TRAJECTORY) is None:
         detail = f"no {TRAJECTORY} in it" if folder.is_dir() else f"no folder {folder.name}"
         return RunFault(MISSING, detail)
-    steps = len(truth.pose)
-    path = _Table(folder / TRAJECTORY)
+    steps = len(truth.robot)
+    path = _EstimateTable(folder / TRAJECTORY)
     if not path.header:
         return RunFault(EARLY, f"{TRAJECTORY} is empty")
     at = path.steps(truth)
@@ -244,7 +251,7 @@ def read_estimate(
     for row, step in enumerate(at.tolist()):
         if step >= 0 and row_of.setdefault(step, row) != row:
             line = path.lines[row_of[step]]
-            raise path.error(row, f"expected each time once, got that of line {line} again")
+            raise path.error(f"expected each time once, got that of line {line} again", row)
     judged = range(stride - 1, steps, stride)
     present = [step for step in judged if step in row_of]
     if len(present) < len(judged):
@@ -255,51 +262,66 @@ def read_estimate(
     rows = [row_of[step] for step in judged]
     poses = path.values(_POSE)[rows]
     covs = _symmetric(path.values(_POSE_COV)[rows], 3)
+    beside = _read_further(path, rows, further)
     maps = innovations = None
     if stored_file(folder / MAP) is not None:
-        maps = _read_map(_Table(folder / MAP), truth)
+        maps = _read_map(_EstimateTable(folder / MAP), truth)
     if stored_file(folder / INNOVATIONS) is not None:
-        innovations = _read_innovations(_Table(folder / INNOVATIONS), truth, size)
+        innovations = _read_innovations(_EstimateTable(folder / INNOVATIONS), truth, size)
         if isinstance(innovations, RunFault):
             return innovations
     with refusals_of(str(folder)):
-        return as_estimate(RunEstimate(poses, covs, maps, innovations))
+        return as_estimate(RunEstimate(poses, covs, maps, innovations, *beside))
 
 
-def _read_map(path: "_Table", truth: TruthOfRun) -> tuple[np.ndarray, ...]:
+def _read_further(
+    path: "_EstimateTable", rows: Sequence[int], further: Sequence[str]
+) -> tuple[np.ndarray, np.ndarray] | tuple[None, None]:
+    """What the robot has beside its pose, and the covariances; None where the file has no column
+    of these names."""
+    names = list(map(label, further))
+    path.units |= {name: split_unit(column)[1] for name, column in zip(names, further, strict=True)}
+    if not set(names) & set(path.names):
+        return None, None
+    pairs = [(names[i], names[j]) for i, j in zip(*np.triu_indices(len(names)), strict=True)]
+    triangle = path.values([f"c_{a}_{b}" for a, b in pairs])[rows]
+    return path.values(names)[rows], _symmetric(triangle, len(names))
+
+
+def _read_map(path: "_EstimateTable", truth: TruthOfRun) -> tuple[np.ndarray, ...]:
     """Means, covariances and tags of the landmarks that have a name."""
-    tags = path.tags(path.place("landmark", TAG), truth.tags)
+    tags = path.landmarks(path.place_of("landmark", TAG), truth.tags)
     is_named = tags >= 0
     names = [int(tag) for tag in tags[is_named]]
     if len(set(names)) < len(names):
         row = next(i for i, tag in enumerate(tags) if tag >= 0 and tag in tags[:i])
-        raise path.error(row, "expected a landmark once, got it twice")
+        raise path.error("expected a landmark once, got it twice", row)
     covs = _symmetric(path.values(_POINT_COV), 2)
     return path.values(_POINT)[is_named], covs[is_named], tags[is_named]
 
 
-def _read_innovations(path: "_Table", truth: TruthOfRun, size: int) -> Innovations | RunFault:
+def _read_innovations(
+    path: "_EstimateTable", truth: TruthOfRun, size: int
+) -> Innovations | RunFault:
     """The innovations; columns that have no name of their own are ν, and S row by row."""
-    used = {path.place(*_TIMES), path.place(TAG)}
+    used = {path.place_of(*_TIMES), path.place_of(TAG)}
     optional = {name: path.values((name,))[:, 0] for name in _OF_INNOVATIONS if name in path.names}
-    used |= {path.place(name) for name in optional}
+    used |= {path.place_of(name) for name in optional}
     places = [place for place in range(len(path.header)) if place not in used]
     expected = size + size * (size + 1) // 2
     if len(places) != expected:
-        raise InvalidFile(
-            path.path,
+        raise path.error(
             f"expected t, tag, {size} columns of ν and {expected - size} of the upper triangle of "
-            f"S, got {', '.join(path.header)}",
-            1,
+            f"S, got {', '.join(path.header)}"
         )
     at = path.steps(truth)
     if isinstance(at, RunFault):
         return at
     if (at < 0).any():
         reason = "expected the time of a measurement, got one of odometry alone"
-        raise path.error(int(np.argmax(at < 0)), reason)
-    numbers = path.numbers(places)
-    tags = path.tags(path.place(TAG), truth.tags)
+        raise path.error(reason, int(np.argmax(at < 0)))
+    numbers = path.side_by_side(places)
+    tags = path.landmarks(path.place_of(TAG), truth.tags)
     S = _symmetric(numbers[:, size:], size)
     return Innovations(at, tags, numbers[:, :size], S, **optional)
 
@@ -320,64 +342,49 @@ def _nearest(times: Float[np.ndarray, "T"], time: Float[np.ndarray, "K"]) -> np.
     return np.where(np.abs(times[nearest] - time) <= _SAME_TIME, nearest, -1)
 
 
-class _Table:
-    """The columns of a CSV file of an estimate; what is not finite is NaN or ∞, and no error."""
+class _EstimateTable(CsvTable):
+    """A CSV file of an estimate; what is not finite is NaN or ∞, and no error.
+
+    It may be empty, or a header alone, of a program that ended at once or had nothing to tell.
+    """
 
     def __init__(self, path: Path) -> None:
-        self.path, data = read_bytes(path)
-        lines = [line for line in data.decode("utf-8-sig", "replace").splitlines() if line.strip()]
-        if len(lines) < 2:  # a header, or nothing: a program that ended at once, or nothing to tell
-            self.header = [cell.strip() for cell in lines[0].split(",")] if lines else []
-            self.lines: list[int] = []
-            self.cells: list[list[str]] = []
-        else:
-            table = CsvTable(path)
-            self.header, self.lines, self.cells = table.header, table.lines, table.cells
-        self.names = [split_unit(name)[0] for name in self.header]
+        super().__init__(path, needs_units=False, may_be_empty=True)
+        self.units: dict[str, str | None] = dict(_UNITS)
 
-    def error(self, row: int, reason: str, place: int | None = None) -> InvalidFile:
-        """The error about a row, and a column."""
-        column = None if place is None else f"column {place + 1} ({self.header[place]})"
-        return InvalidFile(self.path, reason, self.lines[row], column)
+    @property
+    def names(self) -> list[str]:
+        return list(map(label, self.header))
 
-    def place(self, *names: str) -> int:
+    def number(self, cell: str, optional: bool = False) -> float:
+        value = self._value(cell)
+        if math.isnan(value) and cell.lower() not in NO_NUMBER:
+            raise ValueError(f"expected a number, got {cell!r:.60}")
+        return value
+
+    def place_of(self, *names: str) -> int:
         """The place of the column that has one of some names; ValueError without it."""
-        for name in names:
-            if name in self.names:
-                place = self.names.index(name)
-                unit = split_unit(self.header[place])[1]
-                if unit not in (None, _UNITS.get(name)):
-                    reason = f"expected the unit [{_UNITS.get(name, '')}]"
-                    raise InvalidFile(self.path, reason, 1, self.header[place])
-                return place
-        expected, got = " or ".join(map(repr, names)), ", ".join(map(repr, self.header))
-        raise InvalidFile(self.path, f"expected a column {expected}, got {got}", 1)
+        name = next((name for name in names if name in self.names), " or ".join(names))
+        place = self.place(name)
+        unit = split_unit(self.header[place])[1]
+        if unit not in (None, self.units.get(name)):
+            raise self.error(f"expected the unit [{self.units.get(name, '')}]", place=place)
+        return place
 
     def values(self, names: Sequence[str]) -> Float[np.ndarray, "K n"]:
+        """Some columns side by side, by name."""
+        return self.side_by_side([self.place_of(name) for name in names])
+
+    def side_by_side(self, places: Sequence[int]) -> Float[np.ndarray, "K n"]:
         """Some columns side by side."""
-        return self.numbers([self.place(name) for name in names])
-
-    def numbers(self, places: Iterable[int]) -> Float[np.ndarray, "K n"]:
-        """The columns at some places."""
-        columns = list(places)
-        rows = [[self._number(row, place) for place in columns] for row in range(len(self.cells))]
-        return np.asarray(rows, np.float64).reshape(len(self.cells), len(columns))
-
-    def _number(self, row: int, place: int) -> float:
-        cell = self.cells[row][place]
-        try:
-            return float(cell)
-        except ValueError:
-            if cell.lower() in NO_NUMBER:
-                return math.nan
-            raise self.error(row, f"expected a number, got {cell!r:.60}", place) from None
+        return np.column_stack([self.numbers(place) for place in places])
 
     def steps(self, truth: TruthOfRun) -> np.ndarray | RunFault:
         """The step of each row, -1 at a line of odometry that is none.
 
         A fault where a time is neither.
         """
-        time = self.numbers([self.place(*_TIMES)])[:, 0]
+        time = self.numbers(self.place_of(*_TIMES))
         steps = _nearest(truth.time, time)
         fits = (steps >= 0) | (_nearest(truth.odometry_time, time) >= 0)
         if not fits.all():
@@ -385,22 +392,12 @@ class _Table:
             return RunFault(TIMES, f"{self.path.name}:{self.lines[row]}: t = {time[row]:.12g}")
         return steps
 
-    def tags(self, place: int, known_tags: Mapping[int | str, int]) -> np.ndarray:
-        """The row of the landmark in each cell of a column; -1 of an empty one."""
-        rows = np.empty(len(self.cells), int)
-        for row, cells in enumerate(self.cells):
-            cell = cells[place]
-            if cell.lower() in NO_NUMBER or cell in ("-1", "-1.0"):
-                rows[row] = -1
-                continue
-            tag: int | str = cell
-            try:
-                number = float(cell)
-                tag = int(number) if number.is_integer() else cell
-            except (ValueError, OverflowError):
-                pass
-            if tag not in known_tags:
-                reason = f"expected a landmark of landmarks.csv, or nothing, got {cell!r:.60}"
-                raise self.error(row, reason, place)
-            rows[row] = known_tags[tag]
-        return rows
+    def landmarks(self, place: int, tags: Mapping[int | str, int]) -> np.ndarray:
+        """The row of the landmark in each cell of a column by its tag; -1 of an empty one."""
+        names = list(self._read(place, self.tag))
+        for row, name in enumerate(names):
+            if name is not None and name not in tags:
+                got = f"{self.cells(place)[row]!r:.60}"
+                reason = f"expected a landmark of landmarks.csv, or nothing, got {got}"
+                raise self.error(reason, row, place)
+        return np.array([-1 if name is None else tags[name] for name in names], int)

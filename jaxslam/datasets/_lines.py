@@ -3,8 +3,11 @@
 import gzip
 import math
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
 
 from jaxslam.core.validation import InvalidFile
 
@@ -34,12 +37,6 @@ def read_bytes(path: str | Path) -> tuple[Path, bytes]:
     except (OSError, EOFError, zlib.error) as problem:
         reason = getattr(problem, "strerror", None) or f"expected a gzip file, but {problem}"
         raise ValueError(f"{file}: cannot be read: {reason}") from problem
-
-
-def none_left(place: object, dropped: Mapping[str, int]) -> ValueError:
-    """The error about a file whose measurements are all left out, with the reasons."""
-    reasons = ", ".join(f"{count:,} {reason}" for reason, count in dropped.items() if count)
-    return ValueError(f"{place}: no measurement is left, of {reasons or 'none in the file'}")
 
 
 class TextFile:
@@ -89,6 +86,13 @@ class TextFile:
                 if abs(float(field)) > LARGEST:
                     raise self.error(line, f"{name} is beyond ±{LARGEST:g}: {field}")
         return values
+
+    def table(self, names: Sequence[str]) -> tuple[list[int], NDArray[np.float64]]:
+        """The numbers of each line and the number of each; ValueError as `numbers`, and of none."""
+        rows = {line: self.numbers(line, fields, names) for line, fields in self}
+        if not rows:
+            raise self.end_error(f"expected lines {' '.join(names)}, got none")
+        return list(rows), np.array([*rows.values()])
 
     def identity(self, line: int, field: str, name: str) -> int:
         """A field as a whole number >= 0; raises ValueError otherwise."""

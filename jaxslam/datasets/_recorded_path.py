@@ -1,7 +1,6 @@
 """Poses that were recorded with their times, and covariances where there are some: from a topic or
 two frames of a ROS bag, a CSV file as `jaxslam run` writes it, or a file of the TUM benchmark."""
 
-from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,9 +10,10 @@ from jaxtyping import Float, Int
 
 from jaxslam.core._units import are_headings_in_degrees
 from jaxslam.core.logs._streams import geodesic_poses, known_poses
-from jaxslam.core.logs._tables import POSE, TIME, split_unit
+from jaxslam.core.logs._tables import LATEST, POSE, TIME, split_unit
 from jaxslam.core.validation import InvalidFile
-from jaxslam.datasets._landmark_logs.table_reader import CsvTable
+from jaxslam.datasets._account import Account
+from jaxslam.datasets._csv import CsvTable
 from jaxslam.datasets._laser_logs.bag_messages import Bag, is_bag, open_bag
 from jaxslam.datasets._laser_logs.bag_transforms import (
     Frames,
@@ -115,80 +115,56 @@ def recorded_path(source: str | Path) -> RecordedPath:
 
 
 def _path_in_csv(path: Path) -> RecordedPath:
-    file = CsvTable(path)
-    bare = ["time" if "time" in file.names else "t", *(split_unit(name)[0] for name in POSE)]
-    units = dict(zip(file.names, (split_unit(name)[1] for name in file.header), strict=True))
     # A column without a unit is in that of the name, as `jaxslam run` writes it.
-    targets = [split_unit(name)[1] for name in (TIME, *POSE)]
-    wanted = [
-        name if units.get(name) is None else f"{name} [{target}]"
-        for name, target in zip(bare, targets, strict=True)
-    ]
+    file = CsvTable(path, needs_units=False)
+    wanted = ("time [s]" if "time" in file.names else TIME, *POSE)
     entries = [name for name in COVARIANCE if name in file.names]
     if missing := [name for name in COVARIANCE if name not in entries] if entries else []:
-        raise InvalidFile(
-            file.path,
-            f"expected all of {', '.join(COVARIANCE)}, or none, got no {missing[0]}",
-            file.head_line,
-        )
-    if units.get("theta") == "deg" and entries:
-        raise InvalidFile(
-            file.path,
-            "expected theta [rad] beside a covariance, got theta [deg]",
-            file.head_line,
-        )
-    columns = file.table((*wanted, *entries), "of a path", optional=COVARIANCE)
+        raise file.error(f"expected all of {', '.join(COVARIANCE)}, or none, got no {missing[0]}")
+    if entries and split_unit(file.header[file.place(POSE[2])])[1] == "deg":
+        raise file.error("expected theta [rad] beside a covariance, got theta [deg]")
+    columns = file.columns((*wanted, *entries), "of a path", optional=COVARIANCE)
     time = columns.columns[wanted[0]]
-    _check_times(time, lambda row: columns.at(row, wanted[0]))
+    _check_times(time, lambda row, reason: columns.error(row, wanted[0], reason))
     pose = columns.values(wanted[1:])
-    notes = [file.dialect] if file.dialect else []
+    account = Account()
+    account.correct(file.dialect, file.dialect)
     if are_headings_in_degrees(pose):
-        raise InvalidFile(
-            file.path,
-            "expected theta in radians, but it fits the positions in degrees: "
-            + ("write radians" if entries else "write theta [deg]"),
-            file.head_line,
-        )
+        unit = "write radians" if entries else "write theta [deg]"
+        reason = "expected theta in radians, but it fits the positions in degrees"
+        raise file.error(f"{reason}: {unit}")
     cov = None
     if entries:
         upper, lower = np.triu_indices(3)
         cov = np.empty((len(time), 3, 3))
         cov[:, upper, lower] = cov[:, lower, upper] = columns.values(entries)
-    return _make_path(str(path), time, pose, cov, notes=notes)
+    return _make_path(str(path), time, pose, cov, account=account)
 
 
 def _path_in_tum(path: Path) -> RecordedPath:
     file = TextFile(path, comment="#")
-    numbers, rows = [], []
-    for number, fields in file:
-        rows.append(file.numbers(number, fields, TUM))
-        numbers.append(number)
-    if not rows:
-        raise file.end_error(f"expected lines {' '.join(TUM)}, got none")
-    table = np.array(rows)
-    _check_times(table[:, 0], lambda row: f"{file.path}:{numbers[row]}")
+    lines, table = file.table(TUM)
+    _check_times(table[:, 0], lambda row, reason: file.error(lines[row], reason))
     pose = planar(table[:, 1:])
     if not (finite := np.isfinite(pose).all(axis=1)).all():
         row = int(np.argmin(finite))
-        raise file.error(numbers[row], f"expected a quaternion of norm 1, got {rows[row][4:]}")
+        got = table[row, 4:].tolist()
+        raise file.error(lines[row], f"expected a quaternion of norm 1, got {got}")
     return _make_path(str(path), table[:, 0], pose, None)
 
 
-_LATEST = 1e11
-"""[s] after 1970 that is the year 5138; stamps of now have 1.8e12 ms."""
-
-
-def _check_times(time: Float[np.ndarray, "K"], at: Callable[[int], str]) -> None:
-    """Raise ValueError, with the place of a row by `at`, unless times are seconds and rise."""
-    if late := np.flatnonzero(np.abs(time) > _LATEST).tolist():
-        raise ValueError(
-            f"{at(late[0])}: expected a time in seconds, got {time[late[0]]:.4g}: name the column "
-            "of a CSV t [ns], t [us] or t [ms], or divide"
+def _check_times(time: Float[np.ndarray, "K"], error: Callable[[int, str], ValueError]) -> None:
+    """Raise ValueError unless times are seconds and rise. error: (row, reason) -> the error."""
+    if late := np.flatnonzero(np.abs(time) > LATEST).tolist():
+        raise error(
+            late[0],
+            f"expected a time in seconds, got {time[late[0]]:.4g}: name the column of a CSV "
+            "t [ns], t [us] or t [ms], or divide",
         )
     back = np.flatnonzero(np.diff(time) <= 0)
     if back.size:
         before, after = time[back[0] : back[0] + 2].tolist()
-        raise ValueError(f"{at(int(back[0]) + 1)}: expected a time above {before}, got {after}")
+        raise error(int(back[0]) + 1, f"expected a time above {before}, got {after}")
 
 
 def _make_path(
@@ -198,11 +174,11 @@ def _make_path(
     cov: Float[np.ndarray, "K 3 3"] | None,
     *,
     frame: str = "",
-    dropped: dict[str, int] | None = None,
-    notes: Sequence[str] = (),
+    account: Account | None = None,
 ) -> RecordedPath:
     pose = np.column_stack([pose[:, :2], wrapped(pose[:, 2])])
-    return RecordedPath(source, time, pose, cov, frame, dropped or {}, tuple(notes))
+    dropped, notes = (account or Account()).fields.values()
+    return RecordedPath(source, time, pose, cov, frame, dropped, notes)
 
 
 class _StampedPose(NamedTuple):
@@ -256,16 +232,15 @@ def _path_in_bag(source: str, path: Path, inside: str) -> RecordedPath:
             raise bag.error(
                 f"{topic.name}: expected poses in one frame, got {', '.join([frame, *others])}"
             )
-        dropped: Counter[str] = Counter()
-        notes = list(bag.notes)
+        account = Account()
+        account.corrections += bag.notes
         pose = planar(np.array([message.pose for message in messages]))
         finite = np.isfinite(pose).all(axis=1)
         if not finite.any():
             raise bag.error(f"{topic.name}: none of {len(pose):,} messages has a pose in the plane")
-        if lost := int((~finite).sum()):
-            dropped["messages without a pose"] = lost
+        account.drop("messages without a pose", (~finite).sum())
         usable = [message for message, fine in zip(messages, finite, strict=True) if fine]
-        stamp, kept = in_order(bag, topic.name, "messages", usable, dropped, notes)
+        stamp, kept = in_order(bag, topic.name, "messages", usable, account)
         covs = [usable[k].cov for k in kept if usable[k].cov is not None]
     return _make_path(
         source,
@@ -273,8 +248,7 @@ def _path_in_bag(source: str, path: Path, inside: str) -> RecordedPath:
         pose[finite][kept],
         np.array(covs) if covs else None,
         frame=frame,
-        dropped=dict(dropped),
-        notes=notes,
+        account=account,
     )
 
 
@@ -304,10 +278,10 @@ def _path_of_frames(source: str, bag: Bag, parent: str, child: str) -> RecordedP
         ]
         for side in above
     ]
-    dropped: Counter[str] = Counter()
-    notes = list(bag.notes)
+    account = Account()
+    account.corrections += bag.notes
     paths = {
-        frame: _path_of_edge(bag, transforms, frame, above_it, dropped, notes)
+        frame: _path_of_edge(bag, transforms, frame, above_it, account)
         for side in chains
         for frame, above_it in side
     }
@@ -329,8 +303,7 @@ def _path_of_frames(source: str, bag: Bag, parent: str, child: str) -> RecordedP
         ends.append(pose)
     if not is_known.any():
         raise bag.error(f"{parent}:{child}: the transforms between the two have no time in common")
-    if lost := int((~is_known).sum()):
-        dropped["times at which a transform between is unknown"] = lost
+    account.drop("times at which a transform between is unknown", (~is_known).sum())
     pose = between(*ends)[is_known]
     return _make_path(
         source,
@@ -338,8 +311,7 @@ def _path_of_frames(source: str, bag: Bag, parent: str, child: str) -> RecordedP
         pose,
         None,
         frame=parent,
-        dropped=dict(dropped),
-        notes=notes,
+        account=account,
     )
 
 
@@ -348,8 +320,7 @@ def _path_of_edge(
     transforms: Sequence[Transform],
     child: str,
     parent: str,
-    dropped: Counter[str],
-    notes: list[str],
+    account: Account,
 ) -> tuple[Int[np.ndarray, "n"], Float[np.ndarray, "n 3"]]:
     """The stamps [ns] and poses of a frame in its parent; the last one of a static transform."""
     edges = [edge for edge in transforms if (edge.parent, edge.child) == (parent, child)]
@@ -362,5 +333,5 @@ def _path_of_edge(
     if not moving:
         return np.zeros(1, np.int64), pose
     name = f"/tf from {parent} to {child}"
-    stamp, kept = in_order(bag, name, f"transforms to {child}", moving, dropped, notes)
+    stamp, kept = in_order(bag, name, f"transforms to {child}", moving, account)
     return stamp, pose[kept]

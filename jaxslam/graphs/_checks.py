@@ -65,7 +65,27 @@ def check_graph(graph: Graph, factors: Mapping[str, Factor]) -> None:
     check_numbers(graph, factors)
     if not any(np.asarray(table.valid).any() for table in graph.tables.values()):
         raise InvalidField("", "the graph has no measurement")
-    _check_gauge(graph, factors)
+
+    # Each part has a gauge, which holds it in place.
+    parts = _parts_of(graph, factors)
+    loose = np.flatnonzero(~parts.anchored & parts.free)
+    if not len(loose):
+        return
+    members = np.flatnonzero(parts.part == loose[0])
+    labels = ", ".join(label(graph, int(variable)) for variable in members[:3])
+    labels += f", … ({len(members):,} variables)" if len(members) > 3 else ""
+    if parts.free.sum() == 1 and not parts.anchored.any():
+        raise InvalidField(
+            "",
+            "the graph has no gauge: fix a pose (`graphs.with_gauge` fixes the first) or "
+            "give one a prior",
+        )
+    count = int((parts.free | parts.anchored).sum())
+    raise InvalidField(
+        "",
+        f"the graph is disconnected: no measurement with information joins {labels} to a "
+        f"fixed pose or one with a prior; {count} parts, {len(loose)} of them loose",
+    )
 
 
 def check_numbers(graph: Graph, factors: Mapping[str, Factor]) -> None:
@@ -168,29 +188,6 @@ def _check_rows(graph: Graph, key: str, factor: Factor) -> None:
             involved = variables_in(graph, alone, factor)[0]
             between = ", ".join(label(graph, int(variable)) for variable in involved)
             raise InvalidField(f"{key}, row {row} ({between})", why)
-
-
-def _check_gauge(graph: Graph, factors: Mapping[str, Factor]) -> None:
-    """Raise InvalidField on a part of a graph that nothing holds in place."""
-    parts = _parts_of(graph, factors)
-    loose = np.flatnonzero(~parts.anchored & parts.free)
-    if not len(loose):
-        return
-    members = np.flatnonzero(parts.part == loose[0])
-    labels = ", ".join(label(graph, int(variable)) for variable in members[:3])
-    labels += f", … ({len(members):,} variables)" if len(members) > 3 else ""
-    if parts.free.sum() == 1 and not parts.anchored.any():
-        raise InvalidField(
-            "",
-            "the graph has no gauge: fix a pose (`graphs.with_gauge` fixes the first) or "
-            "give one a prior",
-        )
-    count = int((parts.free | parts.anchored).sum())
-    raise InvalidField(
-        "",
-        f"the graph is disconnected: no measurement with information joins {labels} to a "
-        f"fixed pose or one with a prior; {count} parts, {len(loose)} of them loose",
-    )
 
 
 def with_gauge(graph: Graph, factors: Mapping[str, Factor] | None = None) -> Graph:

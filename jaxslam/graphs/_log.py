@@ -25,7 +25,7 @@ from jaxslam.core.validation import (
 )
 from jaxslam.graphs._factor import Factor, FromMotion, FromSensor, NominalMotion, Prior
 from jaxslam.graphs._graph import Graph, Table
-from jaxslam.linearize._first_order import motion_jacobians
+from jaxslam.linearize._first_order import motion_jacobians, nominal_path, predicted_noise
 from jaxslam.math import _linalg as linalg
 from jaxslam.math import se2
 from jaxslam.sensors._suite import Suite, Wrapped
@@ -82,8 +82,9 @@ def of_log(
         capacity: number of points.
     Raises:
         ValueError: on models, a log or a covariance that do not fit, and at the row where a motion
-            or a measurement has a singular noise, or a noise does not move the pose in all
-            directions (a robot at rest, with `Odometry`).
+            or a measurement has a singular noise (at its prediction from the initial graph, where R
+            is no constant), or a noise does not move the pose in all directions (a robot at rest,
+            with `Odometry`).
     """
     with refusals_of("graphs.of_log"):
         check_models(motion, sensor)
@@ -167,7 +168,7 @@ def _points_of(
     if capacity is not None:
         require("capacity", capacity, at_least(1))
         used = valid & (array >= 0)
-        return array * used, used, np.arange(capacity, dtype=np.int32)
+        return array * used.astype(array.dtype), used, np.arange(capacity, dtype=np.int32)
     tagged = np.asarray(valid) & (np.asarray(array) >= 0)
     ids = np.unique(np.asarray(array)[tagged]).astype(np.int32)
     if not len(ids):
@@ -199,13 +200,7 @@ def _graph_of(
     sensor, kind = factor.sensor, jnp.result_type(log.control, log.scan.z)
     control, pose = log.control.astype(kind), pose.astype(kind)
     z = jnp.where(valid[:, :, None], log.scan.z.astype(kind), 0.0)
-    nominal = jnp.zeros(len(motion.noises), kind)
-
-    def move(before: Array, u: Array) -> tuple[Array, Array]:
-        after = motion.step(before, u, nominal)
-        return after, after
-
-    path = jnp.concatenate([pose[None], jax.lax.scan(move, pose, control)[1]])
+    path = jnp.concatenate([pose[None], nominal_path(motion, pose, control)])
     motion_cov = jax.vmap(motion.noise_cov)(path[:-1], control)
     by_noise = jax.vmap(lambda x, u: motion_jacobians(motion, x, u)[1])(path[:-1], control)
     moving = jnp.ones(len(control), bool)
@@ -219,7 +214,15 @@ def _graph_of(
     else:
         over_steps = jax.vmap(_pose_noise, (0, 0, 0, None))
         motion_cov = over_steps(path[1:], by_noise, motion_cov, slack)
-    sensor_cov = jax.vmap(jax.vmap(sensor.noise_cov))(z)
+    points, seen = _place_points(sensor, path[1:], z, index, valid, ids.shape[0])
+    if factor.own_noise:
+        # The weights are by R(ẑ), at first of this graph; R(z) is not used.
+        landmark = points[index] if sensor.landmark else z[..., :0]
+        z_hat = jax.vmap(jax.vmap(sensor.observe, (None, 0)))(path[1:], landmark)
+        by_slot = jax.vmap(jax.vmap(partial(predicted_noise, sensor)))
+        sensor_cov = by_slot(z_hat, z, valid)
+    else:
+        sensor_cov = jax.vmap(jax.vmap(sensor.noise_cov))(z)
     # The prior's error is rotated into the frame of its mean, as the factor needs it.
     turned = jnp.eye(3, dtype=kind).at[:2, :2].set(se2.rotation(pose[2]))
     q, q_regular = jax.vmap(_information)(motion_cov)
@@ -227,7 +230,6 @@ def _graph_of(
     if factor.own_noise:
         r = jnp.broadcast_to(jnp.eye(r.shape[-1], dtype=kind), r.shape)
     p, p_regular = _information(turned.T @ pose_cov.astype(kind) @ turned)
-    points, seen = _place_points(sensor, path[1:], z, index, valid, ids.shape[0])
 
     count = jnp.arange(path.shape[0], dtype=jnp.int32)
     rows = jnp.repeat(count[1:], valid.shape[1])

@@ -149,13 +149,11 @@ def _solve(
     return x
 
 
-def _factor_and_solve(plan: Plan, system: tuple[Array, Array]) -> Array:
+@over_batch
+def _solve_by_factor(plan: Plan, system: tuple[Array, Array]) -> Array:
     """The solutions A⁻¹ b of graphs with a last axis B, (blocks of A, b)."""
     blocks, rhs = system
     return substitute(plan.cholesky, factorize(plan.cholesky, blocks), rhs)
-
-
-_solve_by_factor = over_batch(_factor_and_solve)
 
 
 def optimize(
@@ -240,6 +238,7 @@ def _optimize(
     return _differentiable_search(model, graph, plan, iterations, tolerance)
 
 
+@over_batch
 def _search(
     model: Model, plan: Plan, iterations: Array, tolerance: Array, graph: Graph
 ) -> Solution:
@@ -249,15 +248,12 @@ def _search(
     return search(model, plan, iterations, tolerance, graph)
 
 
-_search_batch = over_batch(_search)
-
-
 @jax.custom_jvp
 def _differentiable_search(
     model: Model, graph: Graph, plan: Plan, iterations: Array, tolerance: Array
 ) -> Solution:
     """The solution of one graph, with derivatives by the graph and by the numbers of the model."""
-    return _search_batch((model, plan, iterations, tolerance), graph)
+    return _search((model, plan, iterations, tolerance), graph)
 
 
 @_differentiable_search.defjvp

@@ -4,6 +4,8 @@ They are taken by forward-mode automatic differentiation. The hand-derived Jacob
 for verification; filters do not use them, so a user's model needs none.
 """
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 from jax import Array
@@ -31,6 +33,21 @@ def motion_jacobians(
     w = jnp.zeros(len(motion.noises), pose.dtype)
     by_pose, by_noise = jax.jacfwd(motion.step, argnums=(0, 2))(pose, u, w)
     return by_pose, by_noise
+
+
+@partial(jax.jit, inline=True)
+def nominal_path(
+    motion: Motion, start: Robot, controls: Float[Array, "T U"]
+) -> Float[Array, "T R"]:
+    """The path x_t = f(x_{t-1}, u_t, 0) of the odometry alone, without its start."""
+    still = jnp.zeros(len(motion.noises), controls.dtype)
+
+    def step(pose: Array, u: Array) -> tuple[Array, Array]:
+        pose = motion.step(pose, u, still)
+        return pose, pose
+
+    path: Array = jax.lax.scan(step, start, controls)[1]
+    return path
 
 
 def observe_jacobians(sensor: Sensor, pose: Robot, landmark: Landmark) -> ObserveJacobians:

@@ -128,8 +128,8 @@ class FirstEstimate(Linearizer):
         landmark, by_pose, cov = first_order.invert_at(sensor, point.pose, z, point.pose, z)
         return landmark, with_lever_arm(by_pose, point.pose[:2] - point.joint.lin.pose[:2]), cov
 
-    def born(self, joint: Joint, born: Array) -> First:
-        landmarks = jnp.where(born[:, None], joint.landmarks, joint.lin.landmarks)
+    def remember(self, joint: Joint, new: Array) -> First:
+        landmarks = jnp.where(new[:, None], joint.landmarks, joint.lin.landmarks)
         return First(joint.lin.pose, landmarks)
 
 
@@ -194,7 +194,7 @@ class Observability(Linearizer):
     ) -> tuple[Array, Array, Array]:
         return first_order.invert_at(sensor, point.pose, z, point.pose, z)
 
-    def born(self, joint: Joint, born: Array) -> _Constraint:
+    def remember(self, joint: Joint, new: Array) -> _Constraint:
         arms = joint.lin.robot[None] + joint.landmarks - joint.pose[None, :2]
-        landmarks = jnp.where(born[:, None], arms, joint.lin.landmarks)
+        landmarks = jnp.where(new[:, None], arms, joint.lin.landmarks)
         return _Constraint(joint.lin.pose, joint.lin.robot, landmarks)

@@ -154,6 +154,40 @@ def change_where(flag: jax.Array, change: Callable[[_T], _T], state: _T) -> _T:
     return where_any(flag, change_flagged, lambda state: state, state)
 
 
+def scan_in_groups(
+    work: Callable[..., tuple[_T, _U]],
+    skip: Callable[[], _U],
+    state: _T,
+    rows: tuple[Array, ...],
+    size: int,
+) -> tuple[_T, _U]:
+    """The state after work(state, *group) on each group of `size` rows in turn, and all results.
+
+    rows: arrays (m, …), of which the last is a mask; the last group is padded with zeros. Results
+    have a leading axis (size,), those returned (m,). In a group without a set row of the mask in
+    any run of a batch, the state stays and the result is skip(), which costs nothing; for a run
+    without one, both must give the same numbers.
+    """
+    m = len(rows[-1])
+    groups = -(-m // size)  # ⌈m/size⌉
+
+    def pad(values: Array) -> Array:
+        """The values in groups, (⌈m/size⌉, size, …)."""
+        padded = jnp.pad(values, [(0, groups * size - m), *[(0, 0)] * (values.ndim - 1)])
+        return padded.reshape(groups, size, *values.shape[1:])
+
+    def step(state: _T, group: tuple[Array, ...]) -> tuple[_T, _U]:
+        mask, skipped = group[-1], skip()
+        return where_any(mask.any(), lambda s: work(s, *group), lambda s: (s, skipped), state)
+
+    state, results = jax.lax.scan(step, state, tuple(pad(values) for values in rows))
+
+    def join(values: Array) -> Array:
+        return values.reshape(groups * size, *values.shape[2:])[:m]
+
+    return state, cast(_U, jax.tree.map(join, results))
+
+
 def hot_jit(
     function: Callable[..., _T], *, static_argnames: tuple[str, ...] = ()
 ) -> Callable[..., _T]:

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from jaxslam.core._record import field, record, static
 from jaxslam.core._reprs import real_array
+from jaxslam.core.logs._tables import label
 from jaxslam.core.protocols import Motion
 from jaxslam.core.validation import InvalidField, finite, instance_of, is_concrete, require
 from jaxslam.math._arrays import Control, ProcessNoise, Robot
@@ -42,7 +43,7 @@ class Augmented(Motion):
 
     def __post_init__(self) -> None:
         names = [field.name for field in dataclasses.fields(self.motion)]
-        for name in self._parameters:
+        for name in self.parameters:
             if name not in names:
                 model = f"{type(self.motion).__name__}, {', '.join(names)}"
                 raise InvalidField("parameter", f"expected a field of {model}, got {name!r}")
@@ -55,7 +56,7 @@ class Augmented(Motion):
 
     @property
     def name(self) -> str:  # type: ignore[override]
-        return f"{self.motion.name} with {' and '.join(self._parameters)}"
+        return f"{self.motion.name} with {' and '.join(self.parameters)}"
 
     @property
     def state(self) -> tuple[str, ...]:  # type: ignore[override]
@@ -68,6 +69,19 @@ class Augmented(Motion):
     @property
     def noises(self) -> tuple[str, ...]:  # type: ignore[override]
         return (*self.motion.noises, *self._names)
+
+    @property
+    def equations(self) -> str:  # type: ignore[override]
+        if not self.motion.equations or any(len(shape) > 1 for shape in self._shapes):
+            return ""
+        labels = list(map(label, self._names))
+        # Before a name may become a list.
+        lines = [f"{name}1 = {name} + w_{name}" for name in labels]
+        rest = iter(labels)
+        for name, shape in zip(self.parameters, self._shapes, strict=True):
+            numbers = list(itertools.islice(rest, math.prod(shape)))
+            lines += [f"{name} = [{', '.join(numbers)}]"] * len(shape)
+        return "\n".join([*lines, self.motion.equations])
 
     def step(self, pose: Robot, u: Control, w: ProcessNoise) -> Robot:
         n, width = len(self.motion.state), len(self.motion.noises)
@@ -83,12 +97,13 @@ class Augmented(Motion):
         return cov
 
     @property
-    def _parameters(self) -> tuple[str, ...]:
+    def parameters(self) -> tuple[str, ...]:
+        """The names of the fields that are states."""
         return (self.parameter,) if isinstance(self.parameter, str) else self.parameter
 
     @property
     def _shapes(self) -> list[tuple[int, ...]]:
-        values = [getattr(self.motion, name) for name in self._parameters]
+        values = [getattr(self.motion, name) for name in self.parameters]
         # A tuple of numbers that are traced has a shape in JAX alone.
         return [np.shape(v) if is_concrete(v) else jnp.asarray(v).shape for v in values]
 
@@ -96,7 +111,7 @@ class Augmented(Motion):
     def _names(self) -> tuple[str, ...]:
         """(k,) the names of the states."""
         names: list[str] = []
-        for name, shape in zip(self._parameters, self._shapes, strict=True):
+        for name, shape in zip(self.parameters, self._shapes, strict=True):
             count = math.prod(shape)
             numbers = [""] if count == 1 else [f" {k + 1}" for k in range(count)]
             names += [f"{name}{number} [{self.unit}]" for number in numbers]
@@ -109,7 +124,7 @@ class Augmented(Motion):
         values = {
             name: robot[first : first + size].reshape(shape)
             for name, shape, size, first in zip(
-                self._parameters, self._shapes, sizes, ends, strict=False
+                self.parameters, self._shapes, sizes, ends, strict=False
             )
         }
         return dataclasses.replace(self.motion, **values)

@@ -1,8 +1,6 @@
 """Files of results: JSON and CSV as text, and writing of all files or none."""
 
 import contextlib
-import csv
-import io
 import json
 import math
 import os
@@ -32,24 +30,6 @@ def json_number(value: SupportsFloat) -> float | None:
     """The number, or None (null) if it is not finite, which JSON does not have."""
     number = float(value)
     return number if math.isfinite(number) else None
-
-
-def csv_text(header: list[str], rows: list[list[str]]) -> str:
-    """Comma-separated text with a header line."""
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(header)
-    writer.writerows(rows)
-    return out.getvalue()
-
-
-def text_table(lines: Sequence[Sequence[str]]) -> list[str]:
-    """The lines of a table as text: the first column is flush left, the others right."""
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    return [
-        "  ".join([line[0].ljust(widths[0]), *map(str.rjust, line[1:], widths[1:])])
-        for line in lines
-    ]
 
 
 def versions() -> dict[str, str]:

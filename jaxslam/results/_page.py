@@ -7,17 +7,14 @@ import base64
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from html import escape
 from importlib.resources import files
-from itertools import groupby
 
-import numpy as np
-
-from jaxslam.consistency import Average, Summary
 from jaxslam.consistency._intervals import EACH, LEVEL, percentage
 from jaxslam.consistency._verdict import TESTS
 from jaxslam.consistency.campaign import Campaign, Comparison
+from jaxslam.core._table import html_of, unbroken, with_word_breaks
+from jaxslam.results import _campaign_tables as tables
 from jaxslam.results import _report as report
-from jaxslam.results import _table as table
-from jaxslam.results._table import VERDICTS, cell_text, heads_of_pairs, short
+from jaxslam.results._campaign_tables import VERDICTS, average_text, badge, table_of, table_of_pairs
 from jaxslam.results.plot import Figure
 from jaxslam.results.plot._style import describe, png
 
@@ -166,7 +163,7 @@ def _figures(figures: Mapping[str, tuple[str, Figure]], draw: Callable[[Figure],
 
 def _conventions(campaign: Campaign) -> str:
     """The definitions of measures and verdicts as HTML."""
-    level, rejected = _without_breaks(percentage(EACH, 1)), _without_breaks(percentage(1 - LEVEL))
+    level, rejected = unbroken(percentage(EACH, 1)), unbroken(percentage(1 - LEVEL))
     meanings = "\n".join(
         f"<dt>{badge(verdict)}</dt><dd>{escape(meaning)}.</dd>"
         for verdict, (_, meaning) in VERDICTS.items()
@@ -210,106 +207,36 @@ def verdict_list(campaign: Campaign) -> str:
     items = []
     for name, summary in campaign.filters.items():
         tested = [key for key in TESTS if key in summary.measures]
-        values = [f"{TESTS[key]} {cell_text(summary.measures[key])}" for key in tested]
+        values = [f"{TESTS[key]} {average_text(summary.measures[key])}" for key in tested]
         if tested and summary.not_finite_runs:
             values.append(f"averages of the {summary.counts['runs']:,} finite runs")
         lines = "".join(f'<span class="why">{line}</span>' for line in values or ["no pose NEES"])
         label = f'<span class="name">{with_word_breaks(name)}</span>'
         items.append(f"<li>{label}{badge(summary.verdict, summary)}{lines}</li>")
-    lost = (f"{name} {phrase}" for name, phrase in table.lost_runs(campaign))
+    lost = (f"{name} {phrase}" for name, phrase in tables.lost_runs(campaign))
     sentences = [*report.sentences_on_verdicts(campaign), *lost]
     notes = [f'<p class="note">{escape(sentence)}.</p>' for sentence in sentences]
     notes += [f"<pre>{escape(text)}</pre>" for text in campaign.notes]
     return "\n".join(['<ul class="verdicts">', *items, "</ul>", *notes])
 
 
-def badge(verdict: str, summary: Summary | None = None) -> str:
-    """A verdict as HTML, with the tests that rejected; with doubts it has an asterisk, and is grey
-    if consistent."""
-    sign, meaning = VERDICTS[verdict]
-    rejected = [TESTS[test] for test in summary.by] if summary is not None else []
-    doubts = summary.doubts if summary is not None else ()
-    kind = "undecided" if doubts and verdict == "consistent" else verdict
-    title = escape("; ".join([meaning, *doubts]))
-    text = escape(verdict + f" ({', '.join(rejected)})" * bool(rejected))
-    mark = f'<span aria-hidden="true">{sign}{"*" * bool(doubts)}</span>'
-    return f'<span class="badge {kind}" title="{title}">{mark} {text}</span>'
-
-
 def measures_table(campaign: Campaign) -> str:
-    """The table of measures × filters as HTML; published values below them."""
-    names = list(campaign.filters)
-    head = "".join(f'<th scope="col">{with_word_breaks(name)}</th>' for name in names)
-    parts = []
-    for group, rows in groupby(table.rows_of(campaign, names), lambda row: row.group):
-        title = f'<th colspan="{len(names) + 2}" scope="rowgroup">{group}</th>'
-        lines = [f'<tr class="group">{title}</tr>'] * bool(group) + [_row(row) for row in rows]
-        parts.append("<tbody>" + "\n".join(lines) + "</tbody>")
-    return _scrolled("Measures of every filter", "measure", head, "\n".join(parts))
+    """The table of measures × filters as HTML."""
+    return html_of(table_of(campaign), "Measures of every filter")
 
 
 def pairs_tables(comparisons: Sequence[Comparison]) -> str:
     """A table of measures for each comparison, and notes below them, as HTML."""
-    tables = []
-    for comparison in comparisons:
-        heads = heads_of_pairs(comparison)
-        head = "".join(f'<th scope="col">{with_word_breaks(name)}</th>' for name in heads)
-        body = "\n".join(map(_row, table.rows_of_pairs(comparison)))
-        tables.append(
-            _scrolled(
-                f"{comparison.first} and {comparison.second} in pairs",
-                with_noun(comparison.runs, "run") + " in pairs",
-                head,
-                f"<tbody>{body}</tbody>",
-            )
-        )
-    return "\n".join([*tables, _notes(table.notes_on_pairs(comparisons))])
-
-
-def _scrolled(label: str, corner: str, head: str, body: str) -> str:
-    """A table as HTML, which scrolls where it is too wide."""
-    return (
-        f'<div class="scroll" tabindex="0" role="region" aria-label="{escape(label)}">'
-        f'<table><thead><tr><th scope="col">{corner}</th><th scope="col">honest</th>{head}</tr>'
-        f"</thead>\n{body}</table></div>"
-    )
-
-
-def _row(row: table.Row) -> str:
-    """A row of the table as HTML."""
-    kind = ' class="sub"' if row.label.startswith(" ") else ""
-    published = row.published or [None] * len(row.cells)
-    cells = (
-        _cell(cell, value, row.level) for cell, value in zip(row.cells, published, strict=True)
-    )
-    return (
-        f'<tr><th scope="row"{kind}>{escape(row.label.strip())}</th>'
-        f'<td class="honest">{escape(_without_breaks(row.honest))}</td>{"".join(cells)}</tr>'
-    )
-
-
-def _cell(cell: table.Cell, published: float | None, level: float) -> str:
-    """A cell of the table as HTML; the pointer on a measure shows its interval."""
-    title, text = "", escape(_without_breaks(cell_text(cell)))
-    if isinstance(cell, Summary):
-        text = badge(cell.verdict, cell)
-    elif isinstance(cell, Average) and np.isfinite(cell.high):
-        ends = f"{cell.low:.5g} to {cell.high:.5g}"
-        digits = 1 if level == EACH else 0
-        title = f' title="{_without_breaks(percentage(level, digits))} interval {ends}"'
-    if published is not None:
-        text += f'<span class="published">published {short(published)}</span>'
-    return f"<td{title}>{text}</td>"
-
-
-def _without_breaks(text: str) -> str:
-    """A text with no line break before a percent sign."""
-    return text.replace(" %", "\N{NO-BREAK SPACE}%")
+    parts = [
+        html_of(table_of_pairs(pair), f"{pair.first} and {pair.second} in pairs")
+        for pair in comparisons
+    ]
+    return "\n".join([*parts, _notes(tables.notes_on_pairs(comparisons))])
 
 
 def measure_notes(campaign: Campaign) -> str:
     """The notes on the measures, as HTML."""
-    return _notes(table.notes_on(campaign))
+    return _notes(tables.notes_on(campaign))
 
 
 def _notes(notes: Iterable[tuple[str, str]]) -> str:
@@ -331,8 +258,3 @@ def duration(seconds: float) -> str:
         return f"{seconds:.1f} s"
     minutes = round(seconds / 60)
     return f"{minutes} min" if minutes < 120 else f"{minutes // 60} h {minutes % 60} min"
-
-
-def with_word_breaks(name: str) -> str:
-    """A name escaped for HTML, with places where it may break."""
-    return escape(name).replace("_", "_<wbr>")

@@ -1,52 +1,41 @@
 """A campaign as text: its table, JSON and CSV."""
 
-import math
 import textwrap
 from collections.abc import Iterable
 
 import numpy as np
 
-from jaxslam.consistency import Average, Summary
+from jaxslam.consistency import Average
 from jaxslam.consistency._intervals import EACH, LEVEL, percentage
 from jaxslam.consistency._measures.coverage import LEVELS
 from jaxslam.consistency._verdict import POWER, TESTS, TOLERANCE, honest_values
 from jaxslam.consistency.campaign import Campaign, Comparison
-from jaxslam.results._files import csv_text, json_number, json_text, text_table, versions
-from jaxslam.results._table import (
+from jaxslam.core._table import Row, csv_number, csv_of, csv_text, terminal_width, text_of
+from jaxslam.results._campaign_tables import (
     VERDICTS,
-    cell_text,
-    heads_of_pairs,
     lost_runs,
     notes_on,
     notes_on_pairs,
-    rows_of,
-    rows_of_pairs,
     short,
+    table_of,
+    table_of_pairs,
 )
+from jaxslam.results._files import json_number, json_text, versions
 
 _COLUMNS = 5
-"""Largest number of filters beside each other."""
+"""Largest number of filters beside each other, but on a terminal."""
 
 _WIDTH = 88
 """Characters of a line of the notes; the narrowest table has some 80."""
 
 
 def campaign_table(campaign: Campaign) -> str:
-    """The campaign as text tables of at most five filters, one column each, with notes below."""
-    names = list(campaign.filters)
-    tables = []
-    for i in range(0, len(names), _COLUMNS):
-        rows = [["", "honest", *names[i : i + _COLUMNS]]]
-        for row in rows_of(campaign, names[i : i + _COLUMNS]):
-            rows.append([row.label, row.honest, *map(cell_text, row.cells)])
-            if row.published:
-                values = ("" if value is None else short(value) for value in row.published)
-                rows.append(["  published", "", *values])
-        table = text_table(rows)
-        table.insert(1, "-" * len(table[0]))
-        tables.append("\n".join(table))
-    tables += [_pairs_table(comparison) for comparison in campaign.comparisons]
-    text = "\n\n".join(tables)
+    """The campaign as text: tables of as many filters as a terminal is wide, elsewhere of five, and
+    notes below."""
+    table = table_of(campaign)
+    table = table._replace(heads=["", *table.heads[1:]])
+    pairs = [text_of(table_of_pairs(pair), rule=True) for pair in campaign.comparisons]
+    text = "\n\n".join([text_of(table, rule=True, most=_COLUMNS), *pairs])
     title = f"{campaign.scenario}: {campaign.size}"
     verdicts = {summary.verdict for summary in campaign.filters.values()}
     notes = [
@@ -59,8 +48,8 @@ def campaign_table(campaign: Campaign) -> str:
         f"inaccurate: final position error over {campaign.divergence_limit:.3g} m, 5 σ of the "
         "ideal EKF; divergent: also over 5 σ of what the filter claims.",
     ]
-    pairs = notes_on_pairs(campaign.comparisons)
-    notes += [f"{term}: {sentence}." for term, sentence in notes_on(campaign) + pairs]
+    terms = notes_on(campaign) + notes_on_pairs(campaign.comparisons)
+    notes += [f"{term}: {sentence}." for term, sentence in terms]
     notes += sentences_on_verdicts(campaign)
     notes += [f"{name} {phrase}" for name, phrase in lost_runs(campaign)]
     if campaign.dtype == "float32":
@@ -72,25 +61,22 @@ def campaign_table(campaign: Campaign) -> str:
         notes.append(
             f"published: {campaign.source}; for the scenario and the filters as in the catalog"
         )
-    lines = [line for note in notes for line in textwrap.wrap(note, _WIDTH)]
-    return "\n".join([title, "", text, "", *lines, *(f"\n{note}" for note in campaign.notes)])
+    below = [*_wrapped(notes), *(f"\n{note}" for note in campaign.notes)]
+    return "\n".join([title, "", text, "", *below])
 
 
 def comparison_text(comparison: Comparison) -> str:
     """Two filters on the same draws as a text table, with notes below."""
     title = f"{comparison.scenario}: {comparison.first} - {comparison.second}"
     notes = [f"{term}: {sentence}." for term, sentence in notes_on_pairs([comparison])]
-    lines = (line for note in notes for line in textwrap.wrap(note, _WIDTH))
-    return "\n".join([title, "", _pairs_table(comparison), "", *lines])
+    table = text_of(table_of_pairs(comparison), rule=True)
+    return "\n".join([title, "", table, "", *_wrapped(notes)])
 
 
-def _pairs_table(comparison: Comparison) -> str:
-    rows = [[f"{comparison.runs:,} runs in pairs", "honest", *heads_of_pairs(comparison)]]
-    for row in rows_of_pairs(comparison):
-        rows.append([row.label, row.honest, *map(cell_text, row.cells)])
-    table = text_table(rows)
-    table.insert(1, "-" * len(table[0]))
-    return "\n".join(table)
+def _wrapped(notes: Iterable[str]) -> list[str]:
+    """The lines of notes below a table."""
+    width = min(_WIDTH, terminal_width() or _WIDTH)
+    return [line for note in notes for line in textwrap.wrap(note, width)]
 
 
 def sentences_on_verdicts(campaign: Campaign) -> list[str]:
@@ -223,23 +209,12 @@ def table_csv(campaign: Campaign) -> str:
     Verdicts and bands are text, and so are the doubts, below the verdicts, if a filter has any;
     cells without a number are empty.
     """
-    names = list(campaign.filters)
-    ends = [f"{name}{end}" for name in names for end in ("", " low", " high")]
-    rows = []
-    for row in rows_of(campaign, names):
-        texts = [row.label.strip(), row.honest]
-        for cell in row.cells:  # the value and the ends of its interval
-            if isinstance(cell, Average):
-                texts += [_csv_number(value) for value in cell]
-            elif cell is None or isinstance(cell, Summary):
-                texts += [cell.verdict if cell else "", "", ""]
-            else:
-                texts += [cell.text if cell.value is None else _csv_number(cell.value), "", ""]
-        rows.append(texts)
+    table = table_of(campaign)
+    rows = [Row("verdict", ["consistent", *(s.verdict for s in campaign.filters.values())])]
     doubts = ["; ".join(summary.doubts) for summary in campaign.filters.values()]
     if any(doubts):
-        rows.insert(1, ["doubts", "", *(text for doubt in doubts for text in (doubt, "", ""))])
-    return csv_text(["measure", "honest", *ends], rows)
+        rows.append(Row("doubts", ["", *doubts]))
+    return csv_of(table._replace(rows=[*rows, *table.rows[1:]]), ends=("", " low", " high"))
 
 
 def as_csv(campaign: Campaign) -> str:
@@ -248,7 +223,7 @@ def as_csv(campaign: Campaign) -> str:
     nothing = np.full(campaign.steps, np.nan)  # some filters lack a curve, as of landmarks
     rows: list[list[str]] = []
     for name, s in campaign.filters.items():
-        columns = [map(_csv_number, s.curves.get(key, nothing).tolist()) for key in keys]
+        columns = [map(csv_number, s.curves.get(key, nothing).tolist()) for key in keys]
         rows += [[name, str(step + 1), *row] for step, row in enumerate(zip(*columns, strict=True))]
     return csv_text(["filter", "step", *keys], rows)
 
@@ -256,8 +231,3 @@ def as_csv(campaign: Campaign) -> str:
 def _finite_or_none(values: Iterable[float]) -> list[float | None]:
     """The values, with None for those that are not finite."""
     return [json_number(value) for value in values]
-
-
-def _csv_number(value: float) -> str:
-    """A number as a cell of CSV, empty if it is not finite."""
-    return f"{value:.9g}" if math.isfinite(value) else ""

@@ -4,8 +4,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from jaxslam.core._table import csv_text
+from jaxslam.core.logs._tables import label
 from jaxslam.core.types import Estimate, Info, Status
-from jaxslam.results._files import csv_text
 
 __all__ = ["innovations_csv", "map_csv", "trajectory_csv", "trajectory_tum"]
 
@@ -23,7 +24,7 @@ def trajectory_csv(time: np.ndarray, estimate: Estimate, further: Sequence[str] 
         [np.asarray(time)[:, None], np.asarray(estimate.pose), triangle], axis=1
     )
     if further:
-        labels = [name.partition("[")[0].strip().replace(" ", "_") for name in further]
+        labels = list(map(label, further))
         rows, columns = np.triu_indices(len(labels))
         header += labels + [
             f"c_{labels[i]}_{labels[j]}" for i, j in zip(rows, columns, strict=True)

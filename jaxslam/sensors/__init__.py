@@ -9,6 +9,7 @@ from jaxslam.core._names import Named
 from jaxslam.core.protocols import Sensor
 from jaxslam.sensors._absolute import Absolute, Compass, PositionFix, Speed, TurnRate
 from jaxslam.sensors._bearing_inverse_depth import BearingInverseDepth
+from jaxslam.sensors._bearing_rate import BearingRate
 from jaxslam.sensors._line import Line
 from jaxslam.sensors._partial import BearingOnly, RangeOnly
 from jaxslam.sensors._range_bearing import RangeBearing, RangeBearingNoise
@@ -22,6 +23,7 @@ REGISTRY: dict[str, Callable[..., Sensor]] = Named(
     {
         "bearing_inverse_depth": BearingInverseDepth,
         "bearing_only": BearingOnly,
+        "bearing_rate": BearingRate,
         "compass": Compass,
         "line": Line,
         "position_fix": PositionFix,
@@ -40,6 +42,7 @@ __all__ = [
     "Absolute",
     "BearingInverseDepth",
     "BearingOnly",
+    "BearingRate",
     "Compass",
     "Corrected",
     "Line",

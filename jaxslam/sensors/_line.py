@@ -37,7 +37,7 @@ class Line(Sensor):
     line. Whoever measures lines says on which side the robot is (`features.segments` does);
     `turn_to_positive_distance` gives z of either sign the positive distance.
 
-    A line is no place: `carried` says how it changes with the frame (a turn by φ and a shift by t
+    A line is no place: `carry` says how it changes with the frame (a turn by φ and a shift by t
     give α + φ and r + n·t), `position` is the point n r nearest to the map's origin, and `embed`
     is the line of which that is the point. The covariance of that point is singular where r = 0, so
     a map frame through which no wall passes shows more.

@@ -19,8 +19,26 @@ from jaxslam.math._arrays import (
 )
 
 
+class PolarWithRate(Sensor):
+    """The base of sensors of range, bearing and a rate, whose landmarks are those of the first two.
+
+    The rate tells of the robot, and not where a landmark is.
+    """
+
+    def invert(self, pose: Robot, z: Measurement, s: Unmeasured) -> Landmark:
+        return se2.from_frame(self.frame(pose), se2.rectangular(z[:2]))
+
+    def invert_jacobians(self, pose: Robot, z: Measurement, s: Unmeasured) -> InvertJacobians:
+        by_frame, by_point = se2.from_frame_jacobians(self.frame(pose), se2.rectangular(z[:2]))
+        (inner,) = se2.rectangular_jacobians(z[:2])
+        by_pose = by_frame @ self.frame_jacobian(pose)
+        by_robot = jnp.pad(by_pose, [(0, 0), (0, len(self.robot))])
+        by_z = jnp.pad(by_point @ inner, [(0, 0), (0, 1)])
+        return by_robot, by_z, jnp.zeros((2, 0), pose.dtype)
+
+
 @record
-class RangeRate(Sensor):
+class RangeRate(PolarWithRate):
     """The Doppler sensor of point landmarks at rest.
 
     z = (range r [m], bearing φ [rad], range rate ṙ [m/s]) of l = (x, y): the first two as of
@@ -65,9 +83,6 @@ class RangeRate(Sensor):
         seen = se2.polar_in_frame(self.frame(pose), landmark)
         return jnp.concatenate([seen, self._rate(pose[3:], seen[1])[None]])
 
-    def invert(self, pose: Robot, z: Measurement, s: Unmeasured) -> Landmark:
-        return se2.from_frame(self.frame(pose), se2.rectangular(z[:2]))
-
     def observe_jacobians(self, pose: Robot, landmark: Landmark) -> ObserveJacobians:
         frame = self.frame(pose)
         by_frame, by_point = se2.to_frame_jacobians(frame, landmark)
@@ -80,14 +95,6 @@ class RangeRate(Sensor):
         velocity = jnp.zeros((3, len(by_velocity)), pose.dtype).at[2].set(by_velocity)
         by_robot = jnp.concatenate([rows, velocity], axis=1)
         return by_robot, jnp.concatenate([by_landmark, by_bearing * by_landmark[1:]])
-
-    def invert_jacobians(self, pose: Robot, z: Measurement, s: Unmeasured) -> InvertJacobians:
-        by_frame, by_point = se2.from_frame_jacobians(self.frame(pose), se2.rectangular(z[:2]))
-        (inner,) = se2.rectangular_jacobians(z[:2])
-        by_pose = by_frame @ self.frame_jacobian(pose)
-        by_robot = jnp.pad(by_pose, [(0, 0), (0, len(self.robot))])
-        by_z = jnp.pad(by_point @ inner, [(0, 0), (0, 1)])
-        return by_robot, by_z, jnp.zeros((2, 0), pose.dtype)
 
     def _rate(self, velocity: Array, phi: Array) -> Array:
         """The range rate () at a bearing (), of velocity (v,), or (v, ω)."""

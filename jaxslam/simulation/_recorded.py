@@ -17,7 +17,14 @@ from jaxslam.core._units import are_headings_in_degrees
 from jaxslam.core._validation import log_of
 from jaxslam.core.protocols import Motion, Sensor
 from jaxslam.core.types import Log, Truth
-from jaxslam.core.validation import InvalidField, array_of, instance_of, refusals_of, require
+from jaxslam.core.validation import (
+    InvalidField,
+    array_of,
+    finite,
+    instance_of,
+    refusals_of,
+    require,
+)
 from jaxslam.sensors._suite import Suite
 from jaxslam.simulation._worlds import World
 
@@ -91,11 +98,12 @@ def recorded_world(
         motion, sensor: the models that filters and the bound assume of the logs.
         logs: (R,) each with T rows and M measurement slots; in a row without measurements none is
             valid.
-        poses: (R, T, 3) true pose at each row [m, m, rad].
+        poses: (R, T, 3) true pose at each row [m, m, rad]; of a motion model with E further numbers
+            in its state (R, T, 3 + E), all of them.
         landmarks: (N, L) true landmarks, of all runs, or (R, N, L); the tag of one is its row.
-        pose, pose_cov: (3,) and (3, 3), the filter's prior of the pose before the first control,
-            of every run: transform records that begin elsewhere.
-        starts: (R, 3) true pose before the first control; default `pose`.
+        pose, pose_cov: (3,) and (3, 3), or of all 3 + E numbers, the filter's prior of the pose
+            before the first control, of every run: transform records that begin elsewhere.
+        starts: (R, 3), or (R, 3 + E), true pose before the first control; default `pose`.
         origin: (R, T, M) tag of the landmark that each measurement is truly of, -1 of none, where
             associations are to be scored.
         filter_options, published, source: as of `Scenario`.
@@ -108,52 +116,61 @@ def recorded_world(
     with refusals_of("recorded_world"):
         require("motion", motion, instance_of(Motion))
         require("sensor", sensor, instance_of(Sensor))
+
+        # The logs, of one shape.
         if isinstance(logs, Log) or not isinstance(logs, Sequence) or not logs:
             empty = "an empty " * (isinstance(logs, Sequence) and not logs)
             got = f"{empty}{type(logs).__name__}"
             raise InvalidField("logs", f"expected a list of Log, one a run, got {got}")
         slots = sensor.places if isinstance(sensor, Suite) else ()
+        is_log = log_of(len(motion.controls), len(sensor.measurements), slots)
+        shapes = []
         for i, log in enumerate(logs):
-            sizes = len(motion.controls), len(sensor.measurements)
-            require(f"logs[{i}]", log, log_of(*sizes, slots))
-            if np.shape(log.scan.tag) != np.shape(logs[0].scan.tag):
+            require(f"logs[{i}]", log, is_log)
+            shapes.append(np.shape(log.scan.tag))
+            if shapes[i] != shapes[0]:
                 raise InvalidField(
                     "logs",
                     "expected the same numbers of rows and measurement slots, got "
-                    f"{np.shape(logs[0].scan.tag)} in run 0 and {np.shape(log.scan.tag)} in "
-                    f"run {i}",
+                    f"{shapes[0]} in run 0 and {shapes[i]} in run {i}",
                 )
-        table = np.asarray(landmarks, np.float64)
-        if table.ndim == 2:
-            table = np.broadcast_to(table, (len(logs), *table.shape))
         log = jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *logs)
         runs, steps, places = log.scan.tag.shape
+        size = len(motion.state)
+
+        # The truth of each run: a map of all runs and a start of all are repeated.
+        table = np.asarray(landmarks, np.float64)
+        if table.ndim == 2:
+            table = np.broadcast_to(table, (runs, *table.shape))
         if starts is None:
-            starts = np.broadcast_to(np.asarray(pose, np.float64), (runs, 3))
+            start = np.asarray(require("pose", pose, finite(size)), np.float64)
+            starts = np.broadcast_to(start, (runs, size))
+        robots = np.asarray(poses, np.float64)
+        require("poses", robots, array_of(runs, steps, size))
         truth = Truth(
-            np.asarray(poses, np.float64),
+            robots[..., :3],
             table,
             np.zeros((runs, steps), np.int32),
             np.asarray(starts, np.float64),
             None if origin is None else np.asarray(origin),
+            robots[..., 3:] if size > 3 else None,
         )
-        require("poses", truth.pose, array_of(runs, steps, 3))
         require("landmarks", table, array_of(runs, "N", len(sensor.landmark)))
-        require("starts", truth.start, array_of(runs, 3))
+        require("starts", truth.start, array_of(runs, size))
         if truth.origin is not None:
             require("origin", truth.origin, array_of(runs, steps, places, kind=np.integer))
-        numbers = {"poses": truth.pose, "landmarks": table, "starts": truth.start}
+        numbers = {"poses": robots, "landmarks": table, "starts": truth.start}
         for argument, values in numbers.items():
-            finite = np.isfinite(values)
-            if not finite.all():
-                run, *place = np.argwhere(~finite)[0]
-                row, hint = "", ""
-                if argument == "poses":
-                    row, hint = f", row {place[0]}", ": cut the log to rows with a true pose"
-                raise InvalidField(argument, f"expected finite numbers of run {run}{row}{hint}")
+            for run, row, *_ in np.argwhere(~np.isfinite(values))[:1]:
+                advice = f", row {row}: cut the log to rows with a true pose"
+                raise InvalidField(
+                    argument,
+                    f"expected finite numbers of run {run}{advice * (argument == 'poses')}",
+                )
+
+        # The landmark of each tag is a row of the map.
         tags = np.where(log.scan.valid, log.scan.tag, -1)
-        if tags.max(initial=-1) >= table.shape[1]:
-            run, row, _ = np.argwhere(tags >= table.shape[1])[0]
+        for run, row, _ in np.argwhere(tags >= table.shape[1])[:1]:
             raise InvalidField(
                 "logs",
                 f"expected tags below {table.shape[1]}, the number of landmarks, got {tags.max()} "

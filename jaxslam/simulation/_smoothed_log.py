@@ -10,14 +10,15 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.association._rules import Known
 from jaxslam.core.protocols import Motion, Sensor
-from jaxslam.core.types import Log, Status
+from jaxslam.core.types import Estimate, Log, Status
 from jaxslam.core.validation import InvalidField
 from jaxslam.graphs._chain.problem import Iterate, Problem, linearize_at, optimize_chain
 from jaxslam.graphs._solver.search import Ending
 from jaxslam.graphs.smoothing._batch_map import BatchMap
+from jaxslam.linearize._first_order import nominal_path
 from jaxslam.math import _linalg as linalg
 from jaxslam.math._arrays import float64
-from jaxslam.sensors._suite import Suite
+from jaxslam.sensors._suite import Suite, of_robot
 from jaxslam.simulation.spurious import Spurious
 
 _ITERATIONS = 100
@@ -50,9 +51,9 @@ class RecordedLog(Protocol):
     @property
     def tags(self) -> tuple[int | str, ...]: ...
     @property
-    def pose(self) -> Float[np.ndarray, "3"]: ...
+    def pose(self) -> Float[np.ndarray, "R"]: ...
     @property
-    def pose_cov(self) -> Float[np.ndarray, "3 3"]: ...
+    def pose_cov(self) -> Float[np.ndarray, "R R"]: ...
     @property
     def capacity(self) -> int: ...
     @property
@@ -81,6 +82,12 @@ class SmoothedLog(NamedTuple):
     """whether a measurement corrected the map"""
     still: bool
     """whether no motion has a noise"""
+    further: Float[np.ndarray, "T E"]
+    """the most likely numbers of the robot beside its pose, before each motion"""
+    converged: bool
+    """whether a further step of the search makes no difference"""
+    steps: int
+    """of the search"""
 
 
 def associates(options: dict[str, Any]) -> bool:
@@ -101,24 +108,22 @@ def smooth(data: RecordedLog) -> SmoothedLog:
     by_odometry = is_single and sensor.of_points and sensor.free.mean.shape[0] > 0
     with float64():  # in single precision a long log does not converge
         if by_odometry and not associates(data.filter_options):
-            smoothed, ending, step, count = _from_odometry(data)
+            smoothed = _from_odometry(data)
         else:
-            smoothed, ending, step, count = _from_filter(data)
-    is_near = ending == Ending.CONVERGED or step < _NEAR
-    if not (
-        is_near and np.isfinite(smoothed.noise).all() and np.isfinite(smoothed.landmarks).all()
-    ):
+            smoothed = _from_filter(data)
+    is_finite = np.isfinite(smoothed.noise).all() and np.isfinite(smoothed.landmarks).all()
+    if not (smoothed.converged and is_finite):
         raise InvalidField(
             "dataset",
-            f"the smoothing of {data.name} did not converge in {count} steps: look at the path of "
-            "jaxslam run, fit the noises (jaxslam fit FOLDER --write), or set a gate against wrong "
-            "measurements",
+            f"the smoothing of {data.name} did not converge in {smoothed.steps} steps: look at the "
+            "path of jaxslam run, fit the noises (jaxslam fit FOLDER --write), or set a gate "
+            "against wrong measurements",
         )
     return smoothed
 
 
-def _from_filter(data: RecordedLog) -> tuple[SmoothedLog, int, float, int]:
-    """The smoothed log from the path of an EKF; ending, next step, and steps of the search."""
+def _from_filter(data: RecordedLog) -> SmoothedLog:
+    """The smoothed log by `BatchMap`, from the path of an EKF."""
     options = data.filter_options
     chosen = {name: options[name] for name in ("associate", "gate", "births") if name in options}
     start = np.asarray(data.pose, np.float64)
@@ -137,9 +142,11 @@ def _from_filter(data: RecordedLog) -> tuple[SmoothedLog, int, float, int]:
     trace = smoother(jax.tree.map(np.asarray, data.log), jax.random.key(0))
     solved, status, slot = jax.device_get((trace.final, trace.info.status, trace.info.slot))
     # Q is evaluated at the filter's path, where the smoother takes it.
-    before = np.concatenate([start[None], np.asarray(solved.filtered.pose)[:-1]])
+    before = np.concatenate([start[None], _robots(solved.filtered)[:-1]])
     control = np.asarray(data.log.control, np.float64)
     roots = np.asarray(jax.device_get(_noise_roots(data.motion, before, control)))
+
+    # Landmarks by tag, where the log has tags, else by slot; and of each measurement its landmark.
     used = (status == Status.FUSED) | (status == Status.BORN)
     slots = np.flatnonzero(solved.joint.alive)
     tags = np.asarray(solved.joint.tag)[slots]
@@ -147,78 +154,79 @@ def _from_filter(data: RecordedLog) -> tuple[SmoothedLog, int, float, int]:
         slots, tags = slots[np.argsort(tags)], np.sort(tags)
     row = np.full(len(solved.joint.alive), -1)
     row[slots] = np.arange(len(slots))
-    smoothed = SmoothedLog(
+    robots = np.concatenate([solved.start[None], _robots(jax.device_get(trace.estimate))])
+    return SmoothedLog(
         noise=np.einsum("tij,tj->ti", roots, solved.noise),
         landmarks=np.asarray(solved.joint.landmarks)[slots],
         tag=tags,
         seen=np.where(used, row[np.where(used, slot, 0)], -1),
         fused=bool((status == Status.FUSED).any()),
         still=not roots.any(),
+        further=robots[:-1, 3:],
+        converged=bool(solved.ending == Ending.CONVERGED or solved.step < _NEAR),
+        steps=int(solved.iterations),
     )
-    return smoothed, int(solved.ending), float(solved.step), int(solved.iterations)
 
 
-def _from_odometry(data: RecordedLog) -> tuple[SmoothedLog, int, float, int]:
-    """The smoothed log from the path of the odometry, tags known; as `_from_filter`."""
+def _robots(estimate: Estimate) -> Float[np.ndarray, "T R"]:
+    """The poses of estimates, with what they have beside these."""
+    parts = [estimate.pose] if estimate.further is None else [estimate.pose, estimate.further]
+    return np.concatenate(list(map(np.asarray, parts)), axis=1)
+
+
+def _from_odometry(data: RecordedLog) -> SmoothedLog:
+    """The smoothed log by the same search, from the path of the odometry, with known tags."""
     log: Log = jax.tree.map(np.asarray, data.log)
     start = np.asarray(data.pose, np.float64)
     control = np.asarray(log.control, np.float64)
-    path = np.asarray(jax.device_get(_nominal_path(data.motion, start, control)))
+    path = np.asarray(jax.device_get(nominal_path(data.motion, start, control)))
+
+    # Each landmark begins where it agrees best with its measurements from that path.
     valid = np.asarray(log.scan.valid) & (np.asarray(log.scan.tag) >= 0)
     tags = np.unique(np.asarray(log.scan.tag)[valid])
     slot = np.where(valid, np.searchsorted(tags, log.scan.tag), 0)
     z = np.where(valid[..., None], log.scan.z, 0.0)
+    sensor = of_robot(data.sensor, data.motion.state)
     points = np.stack(
         [
-            _likeliest_place(data.sensor, path[np.nonzero(of)[0]], z[of], path)
+            _likeliest_place(sensor, path[np.nonzero(of)[0]], z[of], path)
             for of in (valid & (slot == k) for k in range(len(tags)))
         ]
     )
+
     before = np.concatenate([start[None], path[:-1]])
     roots = _noise_roots(data.motion, before, control)
     cov = np.asarray(data.pose_cov, np.float64)
     arguments = start, cov, control, roots, z, slot, valid, path, points
-    noise, landmarks, ending, decrement, count = jax.device_get(
-        _solve(data.motion, data.sensor, *arguments)
+    noise, landmarks, solved, ending, decrement, count = jax.device_get(
+        _solve(data.motion, sensor, *arguments)
     )
-    smoothed = SmoothedLog(
+    return SmoothedLog(
         noise=np.einsum("tij,tj->ti", np.asarray(roots), noise),
         landmarks=landmarks,
         tag=tags,
         seen=np.where(valid, slot, -1),
         fused=True,
         still=not np.asarray(roots).any(),
+        further=np.asarray(solved)[:-1, 3:],
+        converged=bool(ending == Ending.CONVERGED or np.sqrt(max(decrement, 0.0)) < _NEAR),
+        steps=int(count),
     )
-    return smoothed, int(ending), float(np.sqrt(max(decrement, 0.0))), int(count)
 
 
 @partial(jax.jit, inline=True)
 def _noise_roots(
-    motion: Motion, before: Float[Array, "T 3"], control: Float[Array, "T U"]
+    motion: Motion, before: Float[Array, "T R"], control: Float[Array, "T U"]
 ) -> Float[Array, "T W W"]:
     """The square root of Q of each row."""
     return jax.vmap(linalg.root_psd)(jax.vmap(motion.noise_cov)(before, control))
 
 
-@partial(jax.jit, inline=True)
-def _nominal_path(
-    motion: Motion, start: Float[Array, "3"], control: Float[Array, "T U"]
-) -> Float[Array, "T 3"]:
-    still = jnp.zeros(len(motion.noises), control.dtype)
-
-    def step(pose: Array, u: Array) -> tuple[Array, Array]:
-        pose = motion.step(pose, u, still)
-        return pose, pose
-
-    path: Array = jax.lax.scan(step, start, control)[1]
-    return path
-
-
 def _likeliest_place(
     sensor: Sensor,
-    poses: Float[np.ndarray, "K 3"],
+    poses: Float[np.ndarray, "K R"],
     z: Float[np.ndarray, "K Z"],
-    path: Float[np.ndarray, "T 3"],
+    path: Float[np.ndarray, "T R"],
 ) -> Float[np.ndarray, "2"]:
     """The point of a grid about the path that agrees best with the measurements of a landmark."""
     low, high = path[:, :2].min(axis=0), path[:, :2].max(axis=0)
@@ -238,7 +246,7 @@ def _likeliest_place(
 @partial(jax.jit, inline=True)
 def _misfit(
     sensor: Sensor,
-    poses: Float[Array, "K 3"],
+    poses: Float[Array, "K R"],
     z: Float[Array, "K Z"],
     counted: Bool[Array, "K"],
     candidates: Float[Array, "C 2"],
@@ -258,17 +266,18 @@ def _misfit(
 def _solve(
     motion: Motion,
     sensor: Sensor,
-    start: Float[Array, "3"],
-    cov: Float[Array, "3 3"],
+    start: Float[Array, "R"],
+    cov: Float[Array, "R R"],
     control: Float[Array, "T U"],
     roots: Float[Array, "T W W"],
     z: Float[Array, "T M Z"],
     slot: Int[Array, "T M"],
     used: Bool[Array, "T M"],
-    path: Float[Array, "T 3"],
+    path: Float[Array, "T R"],
     points: Float[Array, "N 2"],
-) -> tuple[Array, Array, Array, Array, Array]:
-    """Noises of the motions in deviations, points, ending, decrement and steps of the search."""
+) -> tuple[Array, Array, Array, Array, Array, Array]:
+    """Noises of the motions in deviations, points, path, ending, decrement and steps of the
+    search."""
     problem = Problem(start, linalg.root_psd(cov), control, roots, z, slot, used)
     poses = jnp.concatenate([start[None], path])
     at = Iterate(jnp.zeros_like(start), jnp.zeros(roots.shape[:2], z.dtype), poses, points)
@@ -280,6 +289,7 @@ def _solve(
     return (
         search.at.noise,
         search.at.landmarks,
+        search.at.path,
         search.ending,
         search.policy.decrement,
         search.steps,

@@ -20,12 +20,13 @@ from jaxslam._public import publish
 from jaxslam.core._numbers import is_concrete
 from jaxslam.core._record import FrozenDict, field, record, static
 from jaxslam.core.logs._tables import INTERVAL
-from jaxslam.core.protocols import Motion, Sensor, motion_of_pose
+from jaxslam.core.protocols import Motion, Sensor
 from jaxslam.core.types import Log, Truth
 from jaxslam.core.validation import InvalidField, array_of, at_least, or_none, refusals_of, require
 from jaxslam.math import _linalg as linalg
 from jaxslam.math import se2
 from jaxslam.math.angles import wrap
+from jaxslam.sensors._suite import of_robot
 from jaxslam.simulation._scans import draw_gaussian, noisy_scan, normals_like
 from jaxslam.simulation._smoothed_log import RecordedLog, associates, smooth
 from jaxslam.simulation._worlds import World, random_pose
@@ -49,6 +50,13 @@ class Twin(World):
     It is that of `perturb` where the motion model has one. Else Newton's method finds the nearest
     u', and the true path is where u' and w lead; Δt stays. Row t measures the landmarks that the
     log measured there, in its order, with noise R.
+
+    What the robot has beside its pose, as a bias, is drawn anew: at the start as the prior says,
+    and then as w changes it. u' is that with which the pose comes about, so the odometry of a twin
+    has its own bias. A state that multiplies the odometry, as a scale, is found too small by the
+    share σ²/v² of the noise in the square of the velocity, as always where the odometry, and not
+    the path, is noisy (errors in variables): where that is no small part of its deviation, twins
+    say little of it.
     """
 
     name: str = static()
@@ -66,6 +74,9 @@ class Twin(World):
     """(T,) [s] of the rows since the first"""
     pose: ArrayLike = (0.0, 0.0, 0.0)
     pose_cov: ArrayLike = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    further: ArrayLike | None = None
+    """(T, E) the smoothed numbers of the robot beside its pose, before each motion; None where
+    E = 0"""
     spurious: Spurious | None = None
     """see `Scenario.spurious`"""
     capacity: int | None = static(default=None, check=or_none(at_least(1)))
@@ -82,6 +93,8 @@ class Twin(World):
         super().__post_init__()
         rows = self.steps, len(self.motion.noises)
         require("noise", self.noise, array_of(*rows))
+        if beside := len(self.motion.state) - 3:
+            require("further", self.further, array_of(self.steps, beside))
         if not np.shape(self.seen)[0] == np.shape(self.time)[0] == self.steps:
             raise InvalidField("seen", f"expected {self.steps} rows, as of controls")
         if is_concrete(self.seen) and np.asarray(self.seen).max() >= np.shape(self.landmarks)[0]:
@@ -104,56 +117,67 @@ class Twin(World):
         key_motion, key_scan, key_start = keys[:3]
         start = random_pose(pose, self.pose_cov, key_start)
         # Without a sensor of absolute poses only a rigid motion of all is uncertain at the start.
-        frame = se2.compose(start, se2.inverse(pose))
+        frame = se2.compose(start[:3], se2.inverse(pose[:3]))
         points = jnp.asarray(self.landmarks, dtype)
-        landmarks = jax.vmap(self.sensor.carried, (None, 0))(frame, points)
+        landmarks = jax.vmap(self.sensor.move_landmark, (None, 0))(frame, points)
         normals = normals_like(key_motion, jnp.asarray(self.noise, dtype))
-        poses, logged = self.drive(start, normals)
+        robots, logged = self.drive(start, normals)
+        is_pose = len(self.motion.state) == 3
+        poses, further = (robots, None) if is_pose else (robots[:, :3], robots[:, 3:])
+        sensor = of_robot(self.sensor, self.motion.state)
         seen = jnp.asarray(self.seen, jnp.int32)
         row_keys = jax.random.split(key_scan, self.steps)
-        of_row = partial(noisy_scan, self.sensor)
-        scan = jax.vmap(of_row, (0, None, 0, 0, 0))(poses, landmarks, seen, seen >= 0, row_keys)
-        truth = Truth(poses, landmarks, jnp.zeros(self.steps, jnp.int32), start)
+        of_row = partial(noisy_scan, sensor)
+        scan = jax.vmap(of_row, (0, None, 0, 0, 0))(robots, landmarks, seen, seen >= 0, row_keys)
+        missed = jnp.zeros(self.steps, jnp.int32)
+        truth = Truth(poses, landmarks, missed, start, further=further)
         if self.spurious is not None:
-            spoil = partial(self.spurious.spoil, self.sensor)
-            scan, origin = jax.vmap(spoil)(poses, scan, jax.random.split(keys[3], self.steps))
+            spoil = partial(self.spurious.spoil, sensor)
+            scan, origin = jax.vmap(spoil)(robots, scan, jax.random.split(keys[3], self.steps))
             truth = truth._replace(origin=origin)
         elif self.associates:
             truth = truth._replace(origin=scan.tag)
         return truth, Log(logged, scan)
 
     def drive(
-        self, start: Float[Array, "3"], normals: Float[Array, "T W"]
-    ) -> tuple[Float[Array, "T 3"], Float[Array, "T U"]]:
-        """The true poses, and the controls in the log, for a start and standard normals; traceable.
+        self, start: Float[Array, "R"], normals: Float[Array, "T W"]
+    ) -> tuple[Float[Array, "T R"], Float[Array, "T U"]]:
+        """The true poses, or robots, and the controls in the log, for a start and standard normals;
+        traceable.
 
         With zeros from `pose` on: the smoothed path, and the controls that lead along it.
         """
         motion, dtype = self.motion, start.dtype
         controls, smoothed = (jnp.asarray(x, dtype) for x in (self.controls, self.noise))
 
-        def step(pose: Array, row: tuple[Array, ...]) -> tuple[Array, tuple[Array, Array]]:
-            u, w_hat, normal = row
-            w = draw_gaussian(motion.noise_cov(pose, u), normal)
-            if motion.perturb is not None:
+        beside = jnp.zeros((self.steps, 0)) if self.further is None else self.further
+
+        def step(robot: Array, row: tuple[Array, ...]) -> tuple[Array, tuple[Array, Array]]:
+            u, w_hat, normal, further_hat = row
+            w = draw_gaussian(motion.noise_cov(robot, u), normal)
+            if motion.perturb is not None and self.further is None:
                 logged = motion.perturb(motion.perturb(u, w_hat), -w)
             else:
-                logged = undoing_control(motion, pose, u, w, motion.step(pose, u, w_hat))
-            pose = motion.step(pose, logged, w)
-            return pose, (pose, logged)
+                smooth = jnp.concatenate([robot[:3], further_hat])
+                target = motion.step(smooth, u, w_hat)
+                logged = undoing_control(motion, robot, u, w, target)
+            robot = motion.step(robot, logged, w)
+            return robot, (robot, logged)
 
-        _, history = jax.lax.scan(step, start, (controls, smoothed, normals))
+        rows = controls, smoothed, normals, jnp.asarray(beside, dtype)
+        _, history = jax.lax.scan(step, start, rows)
         return history
 
 
 def undoing_control(
     motion: Motion,
-    pose: Float[Array, "X"],
+    robot: Float[Array, "R"],
     u: Float[Array, "U"],
     w: Float[Array, "W"],
-    target: Float[Array, "X"],
+    target: Float[Array, "R"],
 ) -> Float[Array, "U"]:
-    """The control u' near u that, with the noise w, leads to the target: f(pose, u', w) ≈ target.
+    """The control u' near u that, with the noise w, leads to the pose of the target:
+    f(robot, u', w) ≈ target.
 
     Gauss-Newton on |f(pose, u', w) ⊖ target|²; Δt is that of u. A change that moves nothing, as at
     rest, is not made.
@@ -162,7 +186,8 @@ def undoing_control(
     damping = float(jnp.finfo(u.dtype).eps) ** 0.75
 
     def gap(u: Array) -> Array:
-        return _difference(target, motion.step(pose, u, w))
+        difference = target[:3] - motion.step(robot, u, w)[:3]
+        return difference.at[2].set(wrap(difference[2]))
 
     moved = u
     for _ in range(_NEWTON):
@@ -176,12 +201,6 @@ def undoing_control(
         step, _ = linalg.solve_psd(system, jacobian.T @ gap(moved))
         moved = moved + jnp.where(moves, step, 0.0) * changes
     return moved
-
-
-def _difference(a: Float[Array, "X"], b: Float[Array, "X"]) -> Float[Array, "X"]:
-    """a - b with the heading wrapped."""
-    difference = a - b
-    return difference.at[2].set(wrap(difference[2]))
 
 
 def twin(dataset: RecordedLog, *, spurious: Spurious | None = None) -> Twin:
@@ -202,14 +221,15 @@ def twin(dataset: RecordedLog, *, spurious: Spurious | None = None) -> Twin:
         spurious: outliers and other faults of the sensor to put into the scans; default those that
             the data set states.
     Raises:
-        ValueError: on a log of several robots, a model with states beside the pose, a log in which
-            no landmark is seen twice, models without noise or with the defaults of a reader, a
-            sensor that `BatchMap` refuses, and where the smoothing does not converge.
+        ValueError: on a log of several robots, a model whose odometry does not move the pose, or
+            moves a number beside it, a log in which no landmark is seen twice, models without noise
+            or with the defaults of a reader, a sensor that `BatchMap` refuses, and where the
+            smoothing does not converge.
     """
     with refusals_of("twin"):
         if dataset.robots:
             raise InvalidField("dataset", "expected the log of one robot: choose one")
-        require("motion", dataset.motion, motion_of_pose)
+        _check_odometry(dataset)
         if dataset.default_noises:
             sections = " and ".join(f"[{name}]" for name in dataset.default_noises)
             raise InvalidField(
@@ -245,6 +265,7 @@ def twin(dataset: RecordedLog, *, spurious: Spurious | None = None) -> Twin:
             landmarks=smoothed.landmarks,
             controls=np.asarray(dataset.log.control, np.float64),
             noise=smoothed.noise,
+            further=smoothed.further if smoothed.further.shape[1] else None,
             seen=seen.astype(np.int32),
             time=np.asarray(dataset.time, np.float64) - float(dataset.time[0]),
             pose=np.asarray(dataset.pose, np.float64),
@@ -255,6 +276,26 @@ def twin(dataset: RecordedLog, *, spurious: Spurious | None = None) -> Twin:
             left_out=int(valid.sum() - (seen >= 0).sum()),
             filter_options=dataset.filter_options,
             source=dataset.source,
+        )
+
+
+def _check_odometry(dataset: RecordedLog) -> None:
+    """Raise InvalidField where, of a robot that has more than a pose, no odometry keeps a path."""
+    motion, pose = dataset.motion, jnp.asarray(dataset.pose)
+    if len(motion.state) == 3:
+        return
+    still = jnp.zeros(len(motion.noises), pose.dtype)
+    measured = np.array([name != INTERVAL for name in motion.controls])
+    by_control = jax.jit(jax.vmap(jax.jacfwd(lambda u: motion.step(pose, u, still))))(
+        jnp.asarray(dataset.log.control, pose.dtype)
+    )
+    moves = np.asarray(by_control)[:, :, measured].any(axis=(0, 2))
+    if not moves[:3].any() or moves[3:].any():
+        raise InvalidField(
+            "motion",
+            "expected odometry that moves the pose and nothing else, so that noises of the "
+            f"odometry leave the path as it is, got {motion.name} with "
+            f"{', '.join(motion.state[3:])}",
         )
 
 

@@ -6,6 +6,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import TypedDict
 
+from jaxslam.core._table import Row, Table, text_of
+
 _SHOWN = 3
 """number of wrong entries of a Jacobian that are printed with their values; others by name only"""
 _COLUMNS = (
@@ -203,41 +205,24 @@ class Report:
 
 def report_table(reports: Sequence[Report]) -> str:
     """The table of reports: a line for each model with its largest differences, and a legend."""
-    head = (
-        "",
-        "Jacobians",
-        "by hand",
-        "float64",
-        "float32",
-        "differences",
-        "checks",
-        "linearity",
-        "",
-    )
-    lines = [head]
-    for report in reports:
-        lines.append(
-            (
-                report.model,
+    heads = "Jacobians", "by hand", "float64", "float32", "differences", "checks", "linearity"
+    rows = [
+        Row(
+            report.model,
+            [
                 str(len(report.findings)),
                 str(sum(f.claimed for f in report.findings)),
                 _worst([f.relative for f in report.findings]),
                 _worst([f.float32 for f in report.findings]),
                 _worst([f.differences for f in report.findings]),
                 str(len(report.checks)),
-                "-" if report.linearity is None else f"{report.linearity:.3g}",
-                "ok" if report.passed else f"{report.failures} FAILED",
-            )
+                None if report.linearity is None else f"{report.linearity:.3g}",
+            ],
+            note="ok" if report.passed else f"{report.failures} FAILED",
         )
-    widths = [max(len(line[i]) for line in lines) for i in range(len(head))]
-    text = [
-        "  ".join(
-            cell.ljust(width) if i in (0, len(head) - 1) else cell.rjust(width)
-            for i, (cell, width) in enumerate(zip(line, widths, strict=True))
-        ).rstrip()
-        for line in lines
+        for report in reports
     ]
-    return "\n".join([text[0], "-" * max(map(len, text)), *text[1:], "", *_COLUMNS])
+    return "\n".join([text_of(Table(["", *heads], rows), rule=True), "", *_COLUMNS])
 
 
 def _wrap(text: str, indent: int) -> list[str]:

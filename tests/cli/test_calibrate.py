@@ -120,7 +120,7 @@ def test_the_errors_of_a_simulated_robot_are_found_and_their_uncertainty_is_coun
             "scale = [1.0]",
             r"[motion] scale: expected 2 numbers (travel, turn), got [1.0]",
         ),
-        ("motion", "scale = [0.0, 1.0]", "[motion] scale: expected a travel above 0"),
+        ("motion", "scale = [0.0, 1.0]", "[motion] scale: expected a scale above 0"),
         ("motion", "axis = 0.1", "[motion] axis: expected one of model, noise"),
         ("sensor", "range = [-1, 0]", "[sensor] range: expected a scale above 0"),
         ("sensor", "delay = true", "[sensor] delay: expected 1 number ("),
@@ -164,7 +164,9 @@ def test_models_that_have_no_such_error_are_refused(tmp_path):
     for key in ("axis = 0.1", "range = [1.0, 0.1]", "across = 0.1"):
         settings = text.replace("across = 0.08", key).replace("[0.05, 0.001]", "[0.05]")
         (folder / "dataset.toml").write_text(settings)
-        with pytest.raises(ValueError, match=rf"\[sensor\] {key.split(' ')[0]}: expected a"):
+        with pytest.raises(
+            ValueError, match=rf"\[sensor\] {key.split(' ')[0]}: expected one of .*, the keys of b"
+        ):
             datasets.table(folder)
 
 

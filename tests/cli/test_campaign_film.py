@@ -6,7 +6,7 @@ import worlds
 from PIL import Image, ImageChops
 
 from jaxslam import catalog, plot
-from jaxslam._cli.campaigns.consistency import _write_films as write_films
+from jaxslam._cli.campaigns.consistency import write_films
 
 
 @pytest.mark.sweep

@@ -112,7 +112,7 @@ def assert_loaded_as_judged(out, again):
 WORLDS = """
 import dataclasses
 import numpy as np
-from jaxslam import scenarios, sensors
+from jaxslam import motion, scenarios, sensors
 
 circle = scenarios.circle(20)
 whole = scenarios.cloister(20)
@@ -123,10 +123,22 @@ bearings = dataclasses.replace(
 ranges = dataclasses.replace(
     cloister, filter_options={}, sensor=sensors.RangeOnly([[0.1**2]], free=([0.0], [[0.5**2]]))
 )
+wheels = motion.Augmented(
+    motion.Corrected(motion.Velocity(np.diag([0.1, 0.03, 0.0]) ** 2)), "scale", noise=(0.02, 0.01)
+)
+tyre = dataclasses.replace(
+    circle,
+    motion=wheels,
+    noise_on="robot",
+    pose=(0.0, 0.0, 0.0, 1.0, 1.0),
+    pose_cov=np.diag([0.0, 0.0, 0.0, 0.05, 0.05]) ** 2,
+)
 """
 
 
-@pytest.mark.parametrize("name", swept(["circle", "cloister", "bearings", "ranges"], "ranges"))
+@pytest.mark.parametrize(
+    "name", swept(["circle", "cloister", "bearings", "ranges", "tyre"], "ranges", "tyre")
+)
 def test_draws_that_our_command_runs_have_the_numbers_of_the_campaign(name, tmp_path, undrawn):
     (tmp_path / "worlds.py").write_text(WORLDS)
     scenario, folder = f"{tmp_path / 'worlds.py'}:{name}", tmp_path / "draws"

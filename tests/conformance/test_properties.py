@@ -146,9 +146,9 @@ def test_observations_are_the_same_in_every_map_frame(name, carried, pose, offse
         landmark[:2] = pose[:2] + offset + np.where(np.abs(offset).max() < 2, 3.0, 0.0)
     if "rho [1/m]" in sensor.landmark:  # away from where the line of sight vanishes
         landmark[3] = 0.5 / (1 + np.linalg.norm(offset))
-    moved = call(sensor.carried, carried, landmark)
+    moved = call(sensor.move_landmark, carried, landmark)
     z = call(sensor.observe, pose, landmark)
     assert_close(call(sensor.observe, there, moved), z, seen, 1e-8)
     s = np.asarray(sensor.free.mean)
-    new = call(sensor.carried, carried, call(sensor.invert, pose, z, s))
+    new = call(sensor.move_landmark, carried, call(sensor.invert, pose, z, s))
     assert_close(call(sensor.invert, there, z, s), new, angular(sensor.landmark), 1e-7)

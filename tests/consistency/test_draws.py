@@ -9,6 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.linalg
+import worlds
 
 import jaxslam
 from jaxslam import consistency, datasets, motion, scenarios, sensors
@@ -52,6 +54,23 @@ WORLDS = {
     ),
     "loop_bearing": of_catalog("loop_bearing"),
     "webmap": of_catalog("webmap"),
+    "gyroscope": worlds.gyroscope(8),
+    "tyre": dataclasses.replace(
+        CIRCLE,
+        motion=motion.Augmented(motion.Corrected(CIRCLE.motion), ("scale", "heading"), 0.02),
+        pose=(0.1, 0.2, 0.0, 1.0, 1.0, 0.1),
+        pose_cov=scipy.linalg.block_diag(SKEWED, np.diag([0.05, 0.02, 0.1]) ** 2),
+        noise_on="robot",
+    ),
+    "radar": jaxslam.Scenario(
+        name="radar",
+        motion=motion.ConstantVelocity(np.diag([0.3, 0.1]) ** 2),
+        sensor=sensors.RangeRate(np.diag([0.1, 0.03, 0.05]) ** 2, mount=(0.3, 0.1, 0.2)),
+        landmarks=CIRCLE.landmarks,
+        controls=np.full((8, 1), 0.2),
+        pose=(0.0, 0.0, 0.0, 0.8, 0.2),
+        pose_cov=np.diag([0.0, 0.0, 0.0, 0.3, 0.1]) ** 2,
+    ),
 }
 
 
@@ -83,11 +102,18 @@ def test_draws_refuse_at_once_what_a_campaign_refuses():
 
 
 def nees_of(filter, log, start, truth, rows=slice(None)):
-    """The NEES of the pose at some rows (T,), and where it is regular."""
+    """The NEES of the pose at some rows (T,), and where it is regular; of a robot with further
+    numbers theirs is added."""
     estimate = jaxslam.run(filter, log, *start, KEY).estimate
     pose, cov = (np.asarray(a)[rows] for a in (estimate.pose, estimate.pose_cov))
-    error = pose_error(truth, pose)
-    return block_nees(pose, error, error, cov)["pose"]
+    error = pose_error(truth[:, :3], pose)
+    nees = block_nees(pose, error, error, cov)["pose"]
+    if truth.shape[1] > 3:
+        e = truth[:, 3:] - np.asarray(estimate.further)[rows]
+        P = np.asarray(estimate.further_cov)[rows]
+        square = (e * np.linalg.solve(P, e[..., None])[..., 0]).sum(axis=1)
+        nees = nees._replace(value=nees.value + square)
+    return nees
 
 
 @pytest.mark.parametrize("name", WORLDS)
@@ -96,13 +122,13 @@ def test_a_filter_on_the_tables_has_the_nees_of_the_campaign(name, tmp_path):
     write_draws(world, 2, KEY, tmp_path / "draws")
     data, true = folder_of(tmp_path / "draws", 1)
     truth, log = list(draws(world, 2, KEY))[1]
-    np.testing.assert_array_equal(true[:, 1:], truth.pose)
+    np.testing.assert_array_equal(true[:, 1:], truth.robot)
     table_ekf = EkfSlam(data.motion, data.sensor, data.capacity, **data.filter_options)
     rows = np.searchsorted(data.time, true[:, 0])
     np.testing.assert_array_equal(data.time[rows], true[:, 0])
-    read = nees_of(table_ekf, data.log, (data.pose, data.pose_cov), truth.pose, rows)
+    read = nees_of(table_ekf, data.log, (data.pose, data.pose_cov), truth.robot, rows)
     ekf = jaxslam.catalog.FILTERS["ekf"](world)
-    expected = nees_of(ekf, log, (world.pose, world.pose_cov), truth.pose)
+    expected = nees_of(ekf, log, (world.pose, world.pose_cov), truth.robot)
     np.testing.assert_array_equal(read.regular, expected.regular)
     assert expected.regular.sum() >= 2
     np.testing.assert_allclose(read.value, expected.value, rtol=1e-9, atol=1e-9)
@@ -324,6 +350,27 @@ def test_a_model_of_ones_own_is_written_and_named_where_settings_cannot_say_it(t
         datasets.table(run)
 
 
+def test_states_that_settings_cannot_say_are_named(tmp_path):
+    world = worlds.gyroscope(3)
+    tied = np.array(world.pose_cov)
+    tied[3, 4] = tied[4, 3] = 1e-4
+    both = dataclasses.replace(
+        world,
+        motion=motion.Augmented(motion.Corrected(world.motion), "heading", noise=0.01),
+        pose=(*world.pose, 0.0),
+        pose_cov=np.diag([*np.diag(tied), 0.01]),
+    )
+    for name, changed, unsaid, reason in (
+        ("tied", dataclasses.replace(world, pose_cov=tied), "[state] start_noise", "expected 2"),
+        ("both", both, "[motion] model", "expected one of"),
+    ):
+        (run,) = write_draws(changed, 1, KEY, tmp_path / name)
+        readme = (tmp_path / name / "README.md").read_text()
+        assert f"`dataset.toml` cannot say {unsaid}, so" in readme
+        with pytest.raises(ValueError, match=re.escape(f"{unsaid}: ") + reason):
+            datasets.table(run)
+
+
 def test_noises_and_errors_that_settings_can_say(tmp_path):
     white = motion.Unicycle(motion.WhiteNoise(0.02, 0.03))
     uneven = np.array(CIRCLE.controls)
@@ -376,7 +423,7 @@ FUNCTIONS = {name: getattr(math, name) for name in ("sin", "cos", "tan", "sqrt",
 
 
 def bare(name):
-    return name.split(" ")[0]
+    return name.partition(" [")[0].replace(" ", "_")
 
 
 def solved(model, names):
@@ -404,6 +451,7 @@ MOTIONS = [build(no_noise) for build in motion.REGISTRY.values()]
 MOTIONS.append(
     motion.Corrected(motion.PoseIncrement(no_noise), (1.1, 0.9), (0.01, 0.02), heading=0.3)
 )
+MOTIONS.append(motion.Augmented(MOTIONS[-1], ("wheels", "heading"), noise=0.1))
 SENSORS = [build(no_noise) for build in sensors.REGISTRY.values()]
 SENSORS.append(sensors.Corrected(sensors.RangeBearing(no_noise), (1.1, 0.2), axis=0.1))
 
@@ -458,26 +506,32 @@ def test_the_equations_of_a_noise_are_its_variances(cov, model):
     np.testing.assert_allclose(np.diag(variances), expected, rtol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["circle", "cloister", "webmap", "range_only"])
+def nearly_exact(model):
+    """The model with next to no noise."""
+    if isinstance(model, motion.Substeps | motion.Corrected | motion.Augmented):
+        small = {"noise": 1e-12} if isinstance(model, motion.Augmented) else {}
+        return dataclasses.replace(model, motion=nearly_exact(model.motion), **small)
+    cov = model.noise_cov
+    if isinstance(cov, motion.NoiseDensity):
+        return dataclasses.replace(model, noise_cov=motion.NoiseDensity(cov.sigma * 1e-10))
+    return dataclasses.replace(model, noise_cov=np.asarray(cov.cov) * 1e-20)
+
+
+@pytest.mark.parametrize(
+    "name", ["circle", "cloister", "webmap", "range_only", "gyroscope", "tyre", "radar"]
+)
 def test_the_readme_suffices_to_reckon_a_run_and_to_predict_its_scans(name, tmp_path):
     """The code of the README, run over the files of a world whose noise is next to none."""
     world = WORLDS[name]
     models = {}
     for kind in ("motion", "sensor"):
-        model = getattr(world, kind)
-        inner = model.motion if isinstance(model, motion.Substeps) else model
-        cov = np.asarray(inner.noise_cov.cov) * 1e-20
-        inner = dataclasses.replace(inner, noise_cov=cov)
-        models[kind] = (
-            motion.Substeps(inner, model.count)
-            if inner is not model and isinstance(model, motion.Substeps)
-            else inner
-        )
-    world = dataclasses.replace(world, **models, pose_cov=np.zeros((3, 3)))
+        models[kind] = nearly_exact(getattr(world, kind))
+    state = list(map(bare, world.motion.state))
+    world = dataclasses.replace(world, **models, pose_cov=np.zeros((len(state),) * 2))
     write_draws(world, 1, KEY, tmp_path)
     readme = (tmp_path / "README.md").read_text()
     move, frame, measure = re.findall(r"```python\n(.*?)```", readme, re.DOTALL)
-    start = re.search(r"x, y, theta = (\[.*\])", readme)[0]
+    start = re.search(rf"{', '.join(state)} = (\[.*\])", readme)[0]
 
     def rows(path):
         head, *lines = (tmp_path / path).read_text().splitlines()
@@ -488,22 +542,22 @@ def test_the_readme_suffices_to_reckon_a_run_and_to_predict_its_scans(name, tmp_
     columns, lines = rows("runs/0000/odometry.csv")
     holds = "hold from t" in readme
     times = [float(line[0]) for line in lines]
-    path = {times[0]: (scope["x"], scope["y"], scope["theta"])} if holds else {}
+    path = {times[0]: [scope[name] for name in state]} if holds else {}
     scope |= {f"w_{bare(n)}": 0.0 for n in draw_tables.single_motion(world).noises}
     for k, line in enumerate(lines[:-1] if holds else lines):
         scope |= dict(zip(columns, map(float, line), strict=True))
         scope["dt"] = times[k + 1] - times[k] if holds else 1.0
         exec(move, scope)
-        scope |= {"x": scope["x1"], "y": scope["y1"], "theta": scope["theta1"]}
-        path[times[k + 1] if holds else times[k]] = (scope["x"], scope["y"], scope["theta"])
+        scope |= {name: scope[f"{name}1"] for name in state}
+        path[times[k + 1] if holds else times[k]] = [scope[name] for name in state]
     for line in rows("truth/0000/truth.csv")[1]:
-        t, *pose = map(float, line)
-        np.testing.assert_allclose(path[t], pose, atol=1e-7)
+        t, *robot = map(float, line)
+        np.testing.assert_allclose(path[t], robot, atol=1e-7)
     points = {tag: (float(x), float(y)) for tag, x, y in rows("truth/0000/landmarks.csv")[1]}
     columns, lines = rows("runs/0000/measurements.csv")
     scope |= {f"n_{name}": 0.0 for name in columns[2:]}
     for line in lines[:20]:
-        scope |= dict(zip(("x", "y", "theta"), path[float(line[0])], strict=True))
+        scope |= dict(zip(state, path[float(line[0])], strict=True))
         scope |= dict(zip(("l_x", "l_y"), points[line[1]], strict=True))
         exec(frame, scope)
         exec(measure, scope)

@@ -74,7 +74,7 @@ def test_files_may_be_packed(tmp_path):
         ("272.100 1.2", "271.900 1.2", 3, "time goes back from"),
         ("2.0 3.2", "2.0", 3, "expected 4 fields (time x y theta), got 3"),
         ("2.0 3.2", "2.0 nan", 3, "theta is not a finite number"),
-        (TRUTH, "# Time x y theta\n", 1, "no data in the file"),
+        (TRUTH, "# Time x y theta\n", 1, "expected lines time "),
     ],
 )
 def test_errors_in_the_truth_say_where(tmp_path, old, new, line, reason):

@@ -190,7 +190,7 @@ HEAD = "time,x,y,theta\n"
         HEAD + "1,0,0,north\n",
         "a.csv:2: column 4 .theta.: expected a finite number, got 'north'",
     ),
-    ("a.csv", "time,x,y\n1,0,0\n", "a.csv:1: expected a column 'theta' "),
+    ("a.csv", "time,x,y\n1,0,0\n", r"a.csv:1: expected a column 'theta \[rad\]' "),
     ("a.csv", "time,x,y,theta,c_xx\n1,0,0,0,1\n", "a.csv:1: expected all of c_xx, .* got no c_xy"),
     (
         "a.csv",

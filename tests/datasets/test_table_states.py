@@ -94,6 +94,41 @@ def test_errors_of_the_odometry_are_states_too(tmp_path):
     assert abs(table["scale_2"][-1] - 0.3 / (0.3 + BIAS)) < 0.02
 
 
+COASTING = """
+[motion]
+model = "constant_velocity"
+[state]
+start = [0.5, 0.3]
+start_noise = [0.3, 0.2]
+noise = [0.05, 0.02]
+[sensor]
+noise = [0.05, 0.01]
+"""
+
+
+def test_a_folder_without_odometry_has_times_and_velocities(tmp_path):
+    """`odometry.csv` with times alone is a clock; the run is that of the same log in Python."""
+    tables = recorded()
+    clock = [line.split(",")[0] for line in tables["odometry.csv"].splitlines()]
+    tables["odometry.csv"] = "\n".join(clock) + "\n"
+    folder = write(tmp_path, tables | {"dataset.toml": COASTING})
+    data = datasets.table(folder)
+    assert data.motion.state == (*POSE, "v [m/s]", "omega [rad/s]")
+    np.testing.assert_allclose(data.log.control, [[0.0]] + [[0.2]] * 99)
+    cov = np.asarray(data.motion.noise_cov(data.pose, np.array([0.2])))
+    np.testing.assert_allclose(cov, np.diag([0.05, 0.02]) ** 2 / 0.2)
+    names = [parameter.name for parameter in data.adjustable.parameters]
+    assert names[:2] == ["state v [m/s]", "state omega [rad/s]"] and data.default_noises == ()
+    out = tmp_path / "out"
+    assert run_command(["run", "--dataset", "table", str(folder), "--out", str(out)]) == 0
+    table = np.genfromtxt(out / "trajectory.csv", delimiter=",", names=True)
+    for name, true in (("v", 0.5), ("omega", 0.3)):
+        assert abs(table[name][-30:].mean() - true) < 0.03
+    (folder / "dataset.toml").write_text(COASTING.replace("[state]", "noise = [0.1]\n[state]"))
+    with pytest.raises(ValueError, match=r"\[motion\] noise: expected none: constant_velocity has"):
+        datasets.table(folder)
+
+
 @pytest.mark.sweep
 def test_fit_finds_the_walk_of_a_state(tmp_path, capsys):
     folder = write(tmp_path, recorded() | {"dataset.toml": BIASED})
@@ -111,8 +146,12 @@ def test_fit_finds_the_walk_of_a_state(tmp_path, capsys):
         ('["bias", "scale"]', '["bias"]', r"\[state\] names: expected bias, scale, the states of"),
         ("start = [0.0, 1.0]\n", "", r"\[state\] start: expected 2 numbers \(bias \[rad/s\]"),
         ("start_noise = [0.05, 0.02]", "start_noise = [0.05, -1]", "start_noise: expected numbers"),
-        ('"biased_odometry"', '"odometry"', r"\[state\] names: expected some of none|expected"),
-        ('"biased_odometry"', '"constant_velocity"', "model: expected a model with odometry"),
+        (
+            '"biased_odometry"',
+            '"odometry"',
+            r"\[state\] names: expected some of scale, wheels, heading|expected",
+        ),
+        ('"biased_odometry"', '"constant_velocity"', "names: expected some of v, omega, got"),
     ],
 )
 def test_settings_that_do_not_fit_are_refused(tmp_path, old, new, reason):

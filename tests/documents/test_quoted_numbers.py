@@ -35,6 +35,7 @@ GIVEN = {
     "docs/guide/differentiating.md": {"200"},  # steps
     # beams, the range for none, measurements in a log
     "docs/guide/real_data.md": {"180", "360", "400", "401", "32.767", "61,086", "58,663", "13,403"},
+    "docs/guide/twins.md": {"900"},  # rows of a log
     "docs/methods/association.md": {"500"},  # draws
     "docs/methods/bearings_and_ranges.md": {"2.5", "0.5"},  # standard deviations of range
     "docs/methods/graphs.md": {"100", "434", "3,300"},  # steps, sizes of graphs, a bound of χ²

@@ -28,6 +28,14 @@ def test_another_library_gives_the_same_localization(name, task):
     assert pose < 1e-6 and cov < 1e-4
 
 
+def test_dynamax_gives_the_same_localization_with_a_bias():
+    broken.optional("dynamax")
+    task = alternatives.biased_task(steps=40)
+    ours, theirs = alternatives.biased_with_jaxslam(*task), alternatives.biased_with_dynamax(*task)
+    state, variance = alternatives.difference(theirs, ours)
+    assert state < 1e-6 and variance < 1e-6
+
+
 def test_the_reset_of_gtsam_is_what_differs(task):
     broken.optional("gtsam")
     ours = alternatives.left_invariant(*task)

@@ -14,7 +14,6 @@ from jaxslam import (
     Scenario,
     catalog,
     charts,
-    consistency,
     graphs,
     linearize,
     monte_carlo,
@@ -441,20 +440,41 @@ def test_float32_has_finite_numbers_close_to_those_of_float64():
 # --- sensors of velocities, and parameters as states ----------------------------------------------
 
 
-def test_a_doppler_sensor_beside_the_centre_sees_the_rate_at_which_the_range_changes():
-    sensor = sensors.RangeRate(np.eye(3), mount=(0.4, -0.3, 0.9))
+@pytest.mark.parametrize("mount", [None, (0.4, -0.3, 0.9)])
+@pytest.mark.parametrize(("kind", "entry"), [(sensors.RangeRate, 0), (sensors.BearingRate, 1)])
+def test_a_rate_is_that_of_the_moving_robot(kind, entry, mount):
+    """Of ranges, or of bearings, by differences of NumPy from the robot's velocities."""
+    sensor = kind(np.eye(3), mount=mount)
     robot, landmark = np.array([1.0, 2.0, 0.7, 0.8, -0.5]), np.array([3.0, -1.0])
 
-    def range_at(t):
-        pose = jax.numpy.asarray(robot[:3])
-        twist = jnp.stack([robot[3] * t, 0.0 * t, robot[4] * t])
-        moved = motion.PoseIncrement(np.eye(3)).step(pose, jnp.zeros(3), jnp.zeros(3))
-        from jaxslam import se2
+    def seen_at(t):
+        heading = robot[2] + robot[4] * t
+        radius = robot[3] / robot[4]
+        arc = np.array([np.sin(heading) - np.sin(robot[2]), np.cos(robot[2]) - np.cos(heading)])
+        a, b, gamma = mount or (0.0, 0.0, 0.0)
+        c, s = np.cos(heading), np.sin(heading)
+        eye = robot[:2] + radius * arc + [c * a - s * b, s * a + c * b]
+        gap = landmark - eye
+        return np.array([np.hypot(*gap), np.arctan2(gap[1], gap[0]) - heading - gamma])
 
-        return sensor.observe(jnp.concatenate([se2.boxplus(moved, twist), robot[3:]]), landmark)[0]
+    h = 1e-5
+    rate = (seen_at(h) - seen_at(-h))[entry] / (2 * h)
+    asked = robot[: 3 + len(sensor.robot)]
+    np.testing.assert_allclose(sensor.observe(asked, landmark)[2], rate, rtol=1e-8)
 
-    rate = jax.grad(range_at)(0.0)
-    np.testing.assert_allclose(sensor.observe(robot, landmark)[2], rate, rtol=1e-12)
+
+def test_a_landmark_at_the_sensor_has_the_turn_rate_and_finite_derivatives():
+    """The derivatives are those that JAX finds elsewhere, and zero by the landmark there."""
+    sensor = sensors.BearingRate(np.eye(3), mount=(0.4, 0.0, 0.0))
+    robot, at_sensor = jnp.array([0.0, 0.0, 0.0, 0.8, -0.5]), jnp.array([0.4, 0.0])
+    np.testing.assert_array_equal(sensor.observe(robot, at_sensor), [0.0, 0.0, 0.5])
+    for derive in (jax.jacfwd, jax.jacrev):
+        by_robot, by_landmark = derive(sensor.observe, argnums=(0, 1))(robot, at_sensor)
+        np.testing.assert_array_equal(by_robot[2], [0.0, 0.0, 0.0, 0.0, -1.0])
+        np.testing.assert_array_equal(by_landmark, 0.0)
+    exact = sensor.observe_jacobians(robot, at_sensor)
+    assert all(np.isfinite(part).all() for part in exact)
+    np.testing.assert_array_equal(exact[1], 0.0)
 
 
 def test_velocities_are_found_without_odometry():
@@ -636,9 +656,3 @@ def test_a_filter_that_asks_for_a_state_the_world_has_not_is_refused():
     with pytest.raises(ValueError, match=r"it estimates bias \[rad/s\], scale \[1\]") as caught:
         monte_carlo(world, {"mine": filter}, runs=2, key=KEY)
     assert "\n" not in str(caught.value)
-
-
-def test_tables_of_draws_hold_no_further_states(tmp_path):
-    world, _, _ = biased()
-    with pytest.raises(ValueError, match=r"motion: expected a state that is the pose.*bias"):
-        consistency.write_draws(world, 1, KEY, tmp_path / "draws")

@@ -17,7 +17,7 @@ from jaxslam.association import MaximumLikelihood, Nearest
 from jaxslam.calibration import fit_noise
 from jaxslam.consistency._bound import jacobians_at_truth
 from jaxslam.core.types import Scan, Status
-from jaxslam.graphs.smoothing import FixedLag
+from jaxslam.graphs.smoothing import BatchMap, FixedLag
 
 KEY = jax.random.key(0)
 POINTS = np.array([[3.0, 1.0], [-1.0, 4.0], [-3.0, -1.0], [2.0, -3.0]])
@@ -59,14 +59,15 @@ SHARES = np.array([0.05, 0.1, 0.2])
 
 
 @functools.cache
-def innovations():
+def innovations(*names):
     """NIS, degrees of freedom and pose NEES, by filter and share, of 40 runs."""
 
     def of_run(share, key):
         there = world(share)
         truth, log = simulate(there, key)
-        found = []
-        for filter in (localization(there), filters.EkfSlam(there.motion, there.sensor, 4)):
+        found, some = [], families(there)
+        some["fastslam"] = dataclasses.replace(some["fastslam"], particles=64)
+        for filter in map(some.get, names):
             trace = run(filter, log, there.pose, there.pose_cov, key)
             off = trace.estimate.pose - truth.pose
             off = off.at[:, 2].set(jnp.arctan2(jnp.sin(off[:, 2]), jnp.cos(off[:, 2])))
@@ -80,15 +81,49 @@ def innovations():
     return [np.asarray(part).swapaxes(1, 2) for part in found]
 
 
-@pytest.mark.parametrize("name", ["known map", "slam"])
+@pytest.mark.parametrize("name", ["localization", "ekf"])
 @pytest.mark.parametrize("i", range(len(SHARES)))
 def test_innovations_are_as_large_as_they_claim(i, name):
     """R at z gives 1.06 and 1.3 in the known map at 10 and 20 %, and a NEES of 20 without it."""
-    nis, dof, nees = (part[i, ["known map", "slam"].index(name)] for part in innovations())
-    assert dof.sum() > 10_000
-    assert abs(nis.sum() / dof.sum() - 1) < 3.5 * np.sqrt(2 / dof.sum())
+    both = "localization", "ekf"
+    nis, dof, nees = (part[i, both.index(name)] for part in innovations(*both))
+    assert_right(nis, dof)
     spread = nees.std() / np.sqrt(len(nees))
     assert nees.mean() - 3.5 * spread < 3
+
+
+def assert_right(nis, dof):
+    """NIS of several runs is within its band."""
+    assert dof.sum() > 10_000
+    assert abs(nis.sum() / dof.sum() - 1) < 3.5 * np.sqrt(2 / dof.sum())
+
+
+@pytest.mark.sweep
+@pytest.mark.parametrize("name", ["seif", "fastslam", "fixed lag"])
+def test_innovations_of_other_families_are_as_large_as_they_claim(name):
+    for nis, dof in zip(*innovations(name)[:2], strict=True):
+        assert_right(nis[0], dof[0])
+
+
+@pytest.mark.sweep
+def test_the_batch_has_residuals_of_the_size_of_the_noise_and_a_map_of_the_right_size():
+    """From a known start, at the optimum that `graphs.of_log` has, too."""
+
+    def of_run(share, key):
+        there = world(share)
+        truth, log = simulate(there, key)
+        batch = BatchMap(there.motion, there.sensor, 4, there.pose, there.pose_cov)
+        joint = (final := batch(log, key).final).joint
+        far, wanted = (
+            jnp.linalg.norm(x, axis=1) for x in (joint.landmarks, jnp.asarray(POINTS)[joint.tag])
+        )
+        return 2 * final.cost, (far / wanted).mean() - 1
+
+    runs = jax.vmap(jax.vmap(of_run, (None, 0)), (0, None))
+    chi2, scale = map(np.asarray, jax.jit(runs)(SHARES, jax.random.split(jax.random.key(7), 40)))
+    dof = 40 * (2 * 4 * 60 - 2 * 4)
+    np.testing.assert_allclose(chi2.sum(axis=1) / dof, 1, atol=3.5 * np.sqrt(2 / dof))
+    assert (np.abs(scale.mean(axis=1)) < 3.5 * scale.std(axis=1) / np.sqrt(40)).all()
 
 
 @pytest.mark.sweep
@@ -143,6 +178,38 @@ def test_the_fit_of_the_share_has_no_bias(share, count, steps):
     fit = fit_noise(info, np.array([0.15]), logs)
     assert abs(fit.parameters[0] - share) < 3 * fit.error[0]
     assert fit.error[0] < 0.03 * share
+
+
+@pytest.mark.sweep
+@pytest.mark.parametrize("name", ["localization", "right-invariant"])
+def test_fits_of_many_logs_scatter_about_the_share(name):
+    """The maximum of each log's likelihood, between the shares at which it is evaluated."""
+    count, steps = 60, np.linspace(-0.3, 0.3, 13)
+
+    def likelihoods(share, key):
+        there = world(share)
+        log = simulate(there, key)[1]
+
+        def likelihood(step):
+            models = there.motion, sensor(share * jnp.exp(step))
+            invariant = filters.EkfSlam(*models, 4, chart=charts.RightInvariant())
+            known = filters.Localization(*models, POINTS)
+            filter = known if name == "localization" else invariant
+            return run(filter, log, there.pose, there.pose_cov, KEY).info.log_likelihood.sum()
+
+        return jax.vmap(likelihood)(steps)
+
+    over_logs = jax.vmap(jax.vmap(likelihoods, (None, 0)), (0, None))
+    found = np.asarray(jax.jit(over_logs)(SHARES, jax.random.split(jax.random.key(1), count)))
+    best = np.clip(found.argmax(axis=2), 1, len(steps) - 2)
+    left, middle, right = (
+        np.take_along_axis(found, best[..., None] + k, axis=2)[..., 0] for k in (-1, 0, 1)
+    )
+    # The parabola through three points of log σ.
+    off = steps[best] + 0.5 * (steps[1] - steps[0]) * (left - right) / (left - 2 * middle + right)
+    spread = off.std(axis=1) / np.sqrt(count)
+    assert (spread < 0.01).all()
+    assert (np.abs(off.mean(axis=1)) < 3 * spread).all()
 
 
 # --- the density of a measurement ---------------------------------------------------------------

@@ -4,6 +4,7 @@ import dataclasses
 from functools import cache
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.optimize
@@ -12,6 +13,7 @@ from cases import refused, swept
 from reference import ekf_slam, plane
 
 from jaxslam import graphs, motion, sensors, simulate
+from jaxslam.core.record import record
 from jaxslam.core.types import Log, Scan
 from jaxslam.graphs import Ending
 from jaxslam.graphs.smoothing import BatchMap
@@ -168,6 +170,32 @@ def test_a_noise_that_grows_is_that_of_the_predictions():
     np.testing.assert_allclose(trace.estimate.pose[:, :2], poses[1:, :2], atol=1e-6)
     covs = graphs.marginals(solution, factors).poses
     np.testing.assert_allclose(covs[1:], trace.estimate.pose_cov, rtol=0, atol=1e-7)
+
+
+@record
+class Gap:
+    """A noise that is singular at one range."""
+
+    at: float
+
+    def __call__(self, z):
+        return jnp.diag(SIGMA_Z**2) * (jnp.abs(z[0] - self.at) > 1e-6)
+
+
+def test_a_noise_is_refused_where_it_is_singular_at_a_prediction_and_not_at_a_measurement():
+    world, log = drawn()
+
+    def graph_with(at):
+        sensor = sensors.RangeBearing(Gap(at))
+        return graphs.of_log(log, world.motion, sensor, START, START_COV)[0]
+
+    graph = graph_with(1e3)
+    (pose, point), z = graph.tables["sensor"].who[-1], graph.tables["sensor"].z[-1, 0]
+    offset = np.asarray(graph.points)[point] - np.asarray(graph.poses)[pose, :2]
+    assert graph.tables["sensor"].valid[-1] and abs(np.hypot(*offset) - z) > 1e-3
+    graph_with(float(z))
+    with pytest.raises(ValueError, match=f"range_bearing is singular at row {pose - 1}"):
+        graph_with(float(np.hypot(*offset)))
 
 
 @pytest.mark.sweep

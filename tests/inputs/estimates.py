@@ -38,6 +38,8 @@ def as_a_stranger(world, ekf, traces=None):
                 info.nis[row, place],
                 likely,
             ),
+            of_map.further,
+            of_map.further_cov,
         )
 
     return estimate
@@ -52,7 +54,8 @@ def write_estimates(folder, world, ekf, runs, key):
         time, last = np.arange(1.0, world.steps + 1), jax.tree.map(lambda x: x[-1], trace.estimate)
         target = folder / f"{number:04d}"
         target.mkdir(parents=True)
-        (target / "trajectory.csv").write_text(report.trajectory_csv(time, trace.estimate))
+        path = report.trajectory_csv(time, trace.estimate, world.motion.state[3:])
+        (target / "trajectory.csv").write_text(path)
         (target / "map.csv").write_text(report.map_csv(last, names))
         text = report.innovations_csv(
             time, log.scan.tag, trace.info, names, world.sensor.measurements

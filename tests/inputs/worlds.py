@@ -32,6 +32,20 @@ def ring(steps: int = 100, seed: int = 3) -> Scenario:
     )
 
 
+def gyroscope(steps: int = 20) -> Scenario:
+    """The ring with odometry whose bias and scale are not known, and wander."""
+    there = ring(steps)
+    density = np.array([0.05, 0.02, 0.01, 0.01])
+    return dataclasses.replace(
+        there,
+        name="gyroscope",
+        motion=motion.BiasedOdometry(motion.NoiseDensity(density)),
+        controls=np.tile([0.6, 0.4, 0.2], (steps, 1)),
+        pose=(0.0, 0.0, 0.0, 0.05, 1.0),
+        pose_cov=np.diag([0.1, 0.1, 0.05, 0.1, 0.05]) ** 2,
+    )
+
+
 def scaled(scale: float, steps: int = 20) -> Scenario:
     """The ring with other noises, mount, map, controls and start: every number times the scale."""
     there = ring(steps)

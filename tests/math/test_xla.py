@@ -16,6 +16,7 @@ from jaxslam.math._xla import (
     no_inline,
     one_kernel,
     quick_jit,
+    scan_in_groups,
     where_any,
 )
 
@@ -42,6 +43,30 @@ def test_apart_is_the_function_under_every_transformation():
     np.testing.assert_allclose(sine, np.sin(x))
     slope = jax.vmap(jax.grad(lambda x, y: sum(f(x, y))))(x, y)
     np.testing.assert_allclose(slope, y + np.cos(x))
+
+
+@pytest.mark.parametrize("m", [5, 0])
+def test_a_scan_in_groups_is_a_loop_over_the_groups_with_a_set_row(m):
+    """Rows of the mask: in both runs, in one of them, in none; the last group is not full."""
+    x = np.array([[2.0, 3.0, 5.0, 7.0, 11.0], [13.0, 17.0, 19.0, 23.0, 29.0]])[:, :m]
+    mask = np.array([[1, 0, 0, 0, 1], [0, 0, 0, 0, 1]], bool)[:, :m]
+
+    def work(total, x, mask):
+        return total + jnp.where(mask, x, 0.0).sum(), jnp.where(mask, total * x, 0.0)
+
+    def by_twos(x, mask):
+        return scan_in_groups(work, lambda: jnp.zeros(2), jnp.asarray(1.0), (x, mask), 2)
+
+    totals, products = jax.jit(jax.vmap(by_twos))(x, mask)
+    assert products.shape == (2, m)
+    for run in range(2):
+        total, expected = 1.0, np.zeros(m)
+        for first in range(0, m, 2):
+            group = slice(first, first + 2)
+            expected[group] = mask[run, group] * total * x[run, group]
+            total += (mask[run, group] * x[run, group]).sum()
+        assert totals[run] == total
+        np.testing.assert_array_equal(products[run], expected)
 
 
 def halvings(table, x):

@@ -399,7 +399,7 @@ def test_a_measured_line_is_that_of_the_points_in_the_robots_frame(line):
 
 def test_a_carried_line_goes_through_the_carried_points():
     sensor, line, frame = sensors.Line(NOISE), np.array([1.3, -2.9]), np.array([4.0, -2.0, 1.1])
-    r, alpha = np.asarray(sensor.carried(frame, line))
+    r, alpha = np.asarray(sensor.move_landmark(frame, line))
     points = from_frame(frame, points_of(line, [-2.0, 0.0, 2.0]))
     np.testing.assert_allclose(points @ [np.cos(alpha), np.sin(alpha)], r, atol=1e-12)
     # The side is kept: the normal turns with the frame.

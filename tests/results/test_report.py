@@ -37,6 +37,21 @@ def test_the_table_shows_every_measure_and_verdict(campaign):
     assert "not divided by its dof" in text
 
 
+def test_filters_follow_below_where_a_terminal_has_no_room_beside_each_other(campaign, monkeypatch):
+    heads = {}
+    for columns in (70, 300):
+        monkeypatch.setattr("sys.stdout", io.StringIO())
+        monkeypatch.setattr("sys.stdout.isatty", lambda: True)
+        monkeypatch.setenv("COLUMNS", str(columns))
+        lines = _report.campaign_table(campaign).splitlines()
+        assert max(map(len, lines)) <= columns
+        heads[columns] = [line.split() for line in lines if line.split()[:1] == ["honest"]]
+    assert heads == {
+        70: [["honest", "ekf"], ["honest", "other"]],
+        300: [["honest", "ekf", "other"]],
+    }
+
+
 def test_the_notes_explain_the_gate_the_likelihood_and_the_counts(campaign):
     ekf = campaign.filters["ekf"]
     counts = ekf.counts | {"rejected": 7, "fused": ekf.counts["fused"] - 7}

@@ -6,6 +6,7 @@ import chex
 import jax
 import numpy as np
 import pytest
+import worlds
 from cases import refused
 
 from jaxslam import Scenario, catalog, monte_carlo, motion, recorded_world, sensors, simulate, store
@@ -57,6 +58,21 @@ def test_a_campaign_of_records_is_that_of_the_draws(tmp_path):
     other = recorded(landmarks=np.add(DRAWN.landmarks, 1e-9))
     with pytest.raises(ValueError, match="world"):
         campaign(other, runs=5, key=key, keep=store.resume(tmp_path / "kept"))
+
+
+def test_records_hold_what_the_robot_has_beside_its_pose():
+    world = worlds.gyroscope(5)
+    truths, logs = zip(*(worlds.draw(world, seed) for seed in (0, 1)), strict=True)
+    given = [truth.robot for truth in truths]
+    rest = {"pose": world.pose, "pose_cov": world.pose_cov}
+    made = recorded_world(world.motion, world.sensor, list(logs), given, world.landmarks, **rest)
+    truth, _ = made.run(KEY, 1)
+    np.testing.assert_array_equal(truth.pose, truths[1].pose)
+    np.testing.assert_array_equal(truth.further, truths[1].further)
+    np.testing.assert_array_equal(truth.start, world.pose)
+    with pytest.raises(ValueError, match=r"poses: expected shape \(2, 5, 5\), got \(2, 5, 3\)"):
+        poses = [truth.pose for truth in truths]
+        recorded_world(world.motion, world.sensor, list(logs), poses, world.landmarks, **rest)
 
 
 def test_true_headings_in_degrees_are_told():

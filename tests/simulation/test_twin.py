@@ -210,6 +210,63 @@ def test_a_twin_is_a_world_as_any_other():
     assert found == pytest.approx(expected, rel=1e-4)
 
 
+@cache
+def of_gyroscope():
+    """The yard by odometry with a bias, which the start does not know, and its twin."""
+    biased = motion.BiasedOdometry(motion.NoiseDensity(np.array([0.01, 0.01, 0.01, 0.01])))
+    world = dataclasses.replace(
+        drawn_logs.yard(),
+        motion=biased,
+        pose=np.array([0.0, 0.0, 0.0, 0.1, 1.0]),
+        pose_cov=np.diag([0.0, 0.0, 0.0, 0.1, 0.05]) ** 2,
+    )
+    data = drawn_logs.drawn(world)
+    return data, twin(data)
+
+
+def test_a_bias_is_drawn_anew_and_the_path_stays():
+    """By NumPy: the smoothed path; biases from the prior on, which walk as the model says; and
+    controls that have these biases."""
+    data, world = of_gyroscope()
+    truth, log = draws(world, 800)
+    estimator = smoothing.BatchMap(
+        data.motion, data.sensor, data.capacity, data.pose, data.pose_cov, iterations=100
+    )
+    path = np.asarray(estimator(data.log, jax.random.key(0)).estimate.pose)
+    np.testing.assert_allclose(truth.pose, np.broadcast_to(path, truth.pose.shape), atol=1e-8)
+    assert truth.further.shape == (800, 60, 2)
+    has_covariance(truth.start[:, 3:] - [0.1, 1.0], np.diag([0.1, 0.05]) ** 2)
+    before = np.concatenate([truth.start[:, None, 3:], truth.further[:, :-1]], axis=1)
+    steps = (truth.further - before).reshape(-1, 2)
+    has_covariance(steps[::7], np.diag([0.01, 0.01]) ** 2 * drawn_logs.DT)
+    # Travel and turn of the path, from the controls less what the odometry adds to them.
+    from_start = np.concatenate([np.zeros((1, 3)), path[:-1]])
+    turn = wrapped(path[:, 2] - from_start[:, 2])
+    chord = np.hypot(*(path - from_start)[:, :2].T)
+    travel = chord / np.sinc(turn / 2 / np.pi)
+    noise = np.stack(
+        [
+            log.control[..., 0] - travel / drawn_logs.DT / before[..., 1],
+            log.control[..., 1] - turn / drawn_logs.DT - before[..., 0],
+        ],
+        axis=-1,
+    )
+    has_covariance(noise[:, 20], np.diag([0.01, 0.01]) ** 2 / drawn_logs.DT)
+    has_covariance(noise.reshape(-1, 2)[::7], np.diag([0.01, 0.01]) ** 2 / drawn_logs.DT)
+
+
+def test_a_filter_with_the_bias_is_honest_on_its_twins_and_the_check_passes():
+    data, world = of_gyroscope()
+    filters = {"ekf": catalog.FILTERS["ekf"](world)}
+    summary = monte_carlo(world, filters, 48, KEY, progress=False).filters["ekf"]
+    assert summary.verdict in ("consistent", "undecided")
+    for name in ("nees_of_bias", "nees_of_scale", "nees_further"):
+        value, low, high = summary.measures[name]
+        assert low < 1 < high, name
+    checked = consistency.check_models(world, filters["ekf"], data.log, twins=20, key=KEY)
+    assert checked.findings == (), str(checked)
+
+
 def once_seen():
     data, _ = of_yard()
     valid = np.zeros_like(data.log.scan.valid)
@@ -228,14 +285,23 @@ def not_converging():
     return drawn_logs.with_scan(data, z=z)
 
 
+def coasting():
+    """A log of a robot without odometry."""
+    data, _ = of_yard()
+    log = data.log._replace(control=np.full((60, 1), drawn_logs.DT))
+    model = motion.ConstantVelocity(np.eye(2))
+    beside = {"pose": np.zeros(5), "pose_cov": np.zeros((5, 5))}
+    return dataclasses.replace(data, motion=model, log=log, **beside)
+
+
 @refused(
     (once_seen, "dataset: expected a landmark that is seen twice"),
     (changed(default_noises=("motion",)), r"no noise of \[motion\], .* jaxslam fit FOLDER --write"),
     (changed(motion=motion.Unicycle(np.zeros((2, 2)))), "the motion of yard has no noise"),
     (changed(robots=(object(),)), "expected the log of one robot"),
     (
-        changed(motion=motion.BiasedOdometry(np.eye(4))),
-        r"motion: expected .* with bias \[rad/s\], scale",
+        coasting,
+        r"motion: expected odometry that moves the pose and nothing else.* with v \[m/s\], omega",
     ),
     (not_converging, "the smoothing of yard did not converge"),
     told="twin: .*",

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 
@@ -140,6 +140,16 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(command=run_campaign)
 
 
+class Plan(NamedTuple):
+    """What a command computes."""
+
+    spec: Spec
+    scenario: World
+    filters: Mapping[str, Candidate]
+    data: Dataset | None
+    """the log whose twins are the runs; None for runs of a scenario"""
+
+
 def run_campaign(options: argparse.Namespace, command: str) -> int:
     """Run a campaign, print its table and write its files; returns the exit status.
 
@@ -148,42 +158,22 @@ def run_campaign(options: argparse.Namespace, command: str) -> int:
     """
     # Worlds are drawn in float64 whatever the filters compute in, so both precisions see the same.
     jax.config.update("jax_enable_x64", True)
-    if options.executor is not None and options.devices != "all":
-        raise ValueError("--executor: each worker has one device: expected no --devices with it")
-    spec, user = spec_of(options), UserObjects()
-    data: Dataset | None = None
-    scenario: World
-    if spec.campaign.like is not None:
-        data = read_dataset(spec.campaign.dataset, spec.campaign.like, spec.campaign.robot)
-        if data.assumed:
-            print(summary_table({"": {"defaults taken": list(data.assumed)}}), end="\n\n")
-        scenario = twin(data)
-    else:
-        scenario = user.scenario(spec.campaign.scenario, spec.campaign.steps)
-    filters = user.filters(spec.campaign.filters, scenario)
-    runs, part = spec.campaign.runs, spec.part
-    if spec.compare is not None:
-        if spec.compare not in filters:
-            raise ValueError(
-                f"--compare: expected one of --filters, {', '.join(filters)}, got "
-                f"{spec.compare!r}{closest_name(spec.compare, filters)}"
-            )
-        for option, count in (("filters", len(filters)), ("runs", runs)):
-            if count < 2:
-                raise ValueError(f"--compare: expected two --{option} or more, got {count}")
+    user = UserObjects()
+    plan = plan_of(options, user)
+    spec, runs, part = plan.spec, plan.spec.campaign.runs, plan.spec.part
     if part is not None:
-        block = spec.block or fitting_block(scenario, filters, spec.devices[0])
-        spec = replace(spec, block=block)
-        if (part[0] - 1) * block * len(spec.devices) >= runs:
+        assert spec.block is not None
+        if (part[0] - 1) * spec.block * len(spec.devices) >= runs:
             print(f"part {part[0]} of {part[1]} has no block of the {runs:,} runs")
             return 0
+
     keep = open_store(spec)
     earlier = None if part else earlier_results(spec.out, keep)
     try:
         with user.located_errors(), engine(options.executor) as (executor, workers):
             campaign = monte_carlo(
-                scenario,
-                filters,
+                plan.scenario,
+                plan.filters,
                 runs,
                 jax.random.key(spec.campaign.seed),
                 block=spec.block,
@@ -200,18 +190,7 @@ def run_campaign(options: argparse.Namespace, command: str) -> int:
             shutil.rmtree(keep.folder, ignore_errors=True)
             with contextlib.suppress(OSError):  # it has other files, as results
                 spec.out.rmdir()
-        if isinstance(stop, Incomplete) and stop.campaign is None:
-            raise ValueError(stop) from stop
-        if not isinstance(stop, Interrupted | Incomplete) or stop.campaign is None:
-            raise
-        print(replace(stop.campaign, reference=spec.compare or ""))
-        is_interrupted = isinstance(stop, Interrupted)
-        print(
-            f"\njaxslam: {'interrupted, ' * is_interrupted}{stop}; --resume {spec.out} "
-            "continues it",
-            file=sys.stderr,
-        )
-        return INTERRUPTED if is_interrupted else FAILED
+        return end_early(spec, stop)
     for sentence in keep.set_aside:
         print(f"jaxslam: {sentence}", file=sys.stderr)
     if part is not None:
@@ -221,62 +200,79 @@ def run_campaign(options: argparse.Namespace, command: str) -> int:
             "what is missing, and sums up"
         )
         return 0
+
     if keep.set_aside:  # some runs were computed again
         earlier = None
-    if data is not None:
+    if plan.data is not None:
         campaign = replace(campaign, notes=(*campaign.notes, verdict_on_twins(campaign)))
-    status = _write(spec, scenario, filters, campaign, earlier, command)
-    if isinstance(scenario, Twin) and data is not None:
-        status = max(status, _check(spec, scenario, filters, data, earlier))
+    status = write_campaign(plan, campaign, earlier, command)
+    if plan.data is not None:
+        status = max(status, check_models(plan, earlier))
     is_wrong = any(is_faulty(summary.counts) for summary in campaign.filters.values())
     return FAILED if is_wrong else status
 
 
-def _check(
-    spec: Spec,
-    world: Twin,
-    filters: Mapping[str, Candidate],
-    data: Dataset,
-    earlier: Json | None,
-) -> int:
-    """Compare the log with its twins, which are the runs; returns the exit status.
+def plan_of(options: argparse.Namespace, user: UserObjects) -> Plan:
+    """The checked options, with the scenario and the filters that they name.
 
-    A check that was finished earlier stays as it is.
+    Prints the defaults that the reader of a log took.
     """
-    if earlier is not None and (spec.out / model_checks.CHECK).exists():
-        return 0
-    if spec.campaign.runs < LEAST:
-        print(f"\nno check of the models, which takes --runs {LEAST} or more")
-        return 0
-    checks = model_checks.check_log(
-        world,
-        filters,
-        data.log,
-        spec.campaign.runs,
-        jax.random.key(spec.campaign.seed),
-        devices=spec.devices,
-        block=spec.block or fitting_block(world, filters, spec.devices[0]),
-        dtype=spec.campaign.dtype,
+    if options.executor is not None and options.devices != "all":
+        raise ValueError("--executor: each worker has one device: expected no --devices with it")
+    spec = spec_of(options)
+    campaign = spec.campaign
+    data: Dataset | None = None
+    scenario: World
+    if campaign.like is not None:
+        data = read_dataset(campaign.dataset, campaign.like, campaign.robot)
+        if data.assumed:
+            print(summary_table({"": {"defaults taken": list(data.assumed)}}), end="\n\n")
+        scenario = twin(data)
+    else:
+        scenario = user.scenario(campaign.scenario, campaign.steps)
+    filters = user.filters(campaign.filters, scenario)
+    if spec.compare is not None:
+        if spec.compare not in filters:
+            raise ValueError(
+                f"--compare: expected one of --filters, {', '.join(filters)}, got "
+                f"{spec.compare!r}{closest_name(spec.compare, filters)}"
+            )
+        for option, count in (("filters", len(filters)), ("runs", campaign.runs)):
+            if count < 2:
+                raise ValueError(f"--compare: expected two --{option} or more, got {count}")
+    if spec.part is not None:  # all parts divide the runs into the same blocks
+        block = spec.block or fitting_block(scenario, filters, spec.devices[0])
+        spec = replace(spec, block=block)
+    return Plan(spec, scenario, filters, data)
+
+
+def end_early(spec: Spec, stop: BaseException) -> int:
+    """Print what a campaign has that was interrupted or lacks runs; returns the exit status.
+
+    Any other error, and one that came before the first runs were done, is raised.
+    """
+    if isinstance(stop, Incomplete) and stop.campaign is None:
+        raise ValueError(stop) from stop
+    if not isinstance(stop, Interrupted | Incomplete) or stop.campaign is None:
+        raise stop
+    print(replace(stop.campaign, reference=spec.compare or ""))
+    is_interrupted = isinstance(stop, Interrupted)
+    print(
+        f"\njaxslam: {'interrupted, ' * is_interrupted}{stop}; --resume {spec.out} continues it",
+        file=sys.stderr,
     )
-    drawings = model_checks.check_drawings(checks, spec.figures)
-    return write_results(spec.out, model_checks.check_files(checks), drawings)
+    return INTERRUPTED if is_interrupted else FAILED
 
 
-def _write(
-    spec: Spec,
-    scenario: World,
-    filters: Mapping[str, Candidate],
-    campaign: Campaign,
-    earlier: Json | None,
-    command: str,
-) -> int:
+def write_campaign(plan: Plan, campaign: Campaign, earlier: Json | None, command: str) -> int:
     """Print a campaign and write its files; returns the exit status.
 
-    The files of a campaign that was finished earlier stay as they are.
+    earlier: the results of a campaign that was finished earlier, whose files stay as they are.
     """
-    out, seed = spec.out, spec.campaign.seed
-    names, reference = campaign_files.file_names(spec.figures), spec.compare
+    spec, out, seed = plan.spec, plan.spec.out, plan.spec.campaign.seed
+    reference = spec.compare
     if earlier is not None:
+        # The command and the times are those of the runs, not of this look at them.
         command = str(earlier["command"])
         times: dict[str, Any] = {name: earlier[name] for name in campaign_files.TIMES}
         campaign = replace(campaign, **times)
@@ -287,38 +283,36 @@ def _write(
     campaign = replace(campaign, reference=reference or "")
     print(campaign)
 
-    def film() -> int:
-        if not spec.animate:
-            return 0
-        return _write_films(out, scenario, filters, seed, campaign.dtype)
-
+    names = campaign_files.file_names(spec.figures)
+    failed: list[str] = []
     if earlier is not None and all((out / name).exists() for name in names):
         written = "but films" if spec.animate else "and nothing written"
         print(
             f"\n{out} holds this campaign, finished: nothing was run {written}; "
             f"--runs above {campaign.runs} extends it"
         )
-        return film()
-    if not campaign.first:
-        # An earlier command computed run 0, which the figure of a run needs: run the first filter
-        # with a map over it once more.
-        mapping = [n for n, s in campaign.filters.items() if "rmse_landmarks" in s.measures]
-        name = next(iter(mapping or campaign.filters))
-        key = jax.random.key(seed)
-        truth, log = cast_floats(world_of_run(scenario, key, 0), campaign.dtype)
-        estimate = drive_run(scenario, filters[name], key, 0, truth, log).estimate
-        campaign = replace(campaign, first={name: jax.device_get((truth, estimate))})
-    failed: list[str] = []
-    paths = campaign_files.save_campaign(
-        campaign, out, spec.figures, True, command, seed, failed.append
-    )
-    print("\nwrote " + ", ".join(map(str, paths)))
-    for sentence in failed:
-        print(f"jaxslam: {sentence}", file=sys.stderr)
-    return FAILED if film() or failed else 0
+    else:
+        if not campaign.first:
+            # An earlier command computed run 0, which the figure of a run needs: run the first
+            # filter with a map over it once more.
+            mapping = [n for n, s in campaign.filters.items() if "rmse_landmarks" in s.measures]
+            name = next(iter(mapping or campaign.filters))
+            key = jax.random.key(seed)
+            truth, log = cast_floats(world_of_run(plan.scenario, key, 0), campaign.dtype)
+            trace = drive_run(plan.scenario, plan.filters[name], key, 0, truth, log)
+            campaign = replace(campaign, first={name: jax.device_get((truth, trace.estimate))})
+        paths = campaign_files.save_campaign(
+            campaign, out, spec.figures, True, command, seed, failed.append
+        )
+        print("\nwrote " + ", ".join(map(str, paths)))
+        for sentence in failed:
+            print(f"jaxslam: {sentence}", file=sys.stderr)
+    if spec.animate and write_films(out, plan.scenario, plan.filters, seed, campaign.dtype):
+        return FAILED
+    return FAILED if failed else 0
 
 
-def _write_films(
+def write_films(
     out: Path, scenario: World, filters: Mapping[str, Candidate], seed: int, dtype: str
 ) -> int:
     """Write the film of run 0 of every filter, which runs once more; returns the exit status."""
@@ -338,3 +332,30 @@ def _write_films(
         return film_files(films, suffixed=True)
 
     return write_results(out, {}, {"film": draw})
+
+
+def check_models(plan: Plan, earlier: Json | None) -> int:
+    """Compare the log with its twins, which are the runs; returns the exit status.
+
+    A check that was finished earlier stays as it is.
+    """
+    spec, campaign = plan.spec, plan.spec.campaign
+    assert isinstance(plan.scenario, Twin)
+    assert plan.data is not None
+    if earlier is not None and (spec.out / model_checks.CHECK).exists():
+        return 0
+    if campaign.runs < LEAST:
+        print(f"\nno check of the models, which takes --runs {LEAST} or more")
+        return 0
+    checks = model_checks.check_log(
+        plan.scenario,
+        plan.filters,
+        plan.data.log,
+        campaign.runs,
+        jax.random.key(campaign.seed),
+        devices=spec.devices,
+        block=spec.block or fitting_block(plan.scenario, plan.filters, spec.devices[0]),
+        dtype=campaign.dtype,
+    )
+    drawings = model_checks.check_drawings(checks, spec.figures)
+    return write_results(spec.out, model_checks.check_files(checks), drawings)

@@ -11,7 +11,7 @@ import subprocess
 import tempfile
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from pathlib import Path
 
@@ -48,8 +48,25 @@ class Programs:
     ) -> None:
         self._command, self._draws, self._estimates = command, draws, estimates
         self._limit = limit
-        self._words = _words_of(command)
-        self._files = _checksums(self._words)
+        try:
+            self._words = shlex.split(command)
+        except ValueError as error:
+            raise ValueError(f"--estimator: {command!r}: {error}") from error
+        for place in PLACES:
+            if not any(place in word for word in self._words):
+                raise ValueError(
+                    f"--estimator: expected a command with {PLACES[0]} and {PLACES[1]}, as "
+                    f"'./my_filter {{run}} {{estimate}}', got {command!r}"
+                )
+        if shutil.which(self._words[0]) is None:
+            raise ValueError(f"--estimator: {self._words[0]}: there is no such program")
+        # The SHA-256 of each file that the command names, as its program or a script of it.
+        self._files = {}
+        paths = {word: word for word in self._words[1:]}
+        for word, path in {self._words[0]: shutil.which(self._words[0]) or "", **paths}.items():
+            if Path(path).is_file():
+                with open(path, "rb") as file:
+                    self._files[word] = hashlib.file_digest(file, "sha256").hexdigest()
         self._running: set[subprocess.Popen[bytes]] = set()
         self._lock = threading.Lock()
         self._stops = False
@@ -95,9 +112,12 @@ class Programs:
         if not folder.exists():
             return False
         origin = origin_of(folder)
+        files = origin.get("files")
+        earlier = files if isinstance(files, dict) else {}
+        changed = [name for name, digest in self._files.items() if earlier.get(name) != digest]
         if (command := origin.get("command")) != self._command:
             of = "no command" if command is None else f"the command {command!r}"
-        elif changed := _changed(origin.get("files"), self._files):
+        elif changed:
             of = f"another {', '.join(changed)}, which changed since"
         elif origin.get("log") != self._draws.log_checksum(folder.name):
             of = f"other draws than {self._draws.path}"
@@ -114,8 +134,10 @@ class Programs:
         with tempfile.TemporaryDirectory(dir=self._estimates, prefix=".unfinished-") as hidden:
             estimate, said = Path(hidden).absolute() / name, Path(hidden) / "said"
             estimate.mkdir()
-            places = ((self._draws.path / RUNS / name).absolute(), estimate)
-            words = [_with_places(word, places) for word in self._words]
+            folders = (self._draws.path / RUNS / name).absolute(), estimate
+            place = dict(zip(PLACES, map(str, folders), strict=True))
+            pattern = "|".join(map(re.escape, PLACES))
+            words = [re.sub(pattern, lambda m: place[m[0]], word) for word in self._words]
             began = time.perf_counter()
             with said.open("wb") as file, self._start(words, file.fileno()) as process:
                 try:
@@ -124,7 +146,9 @@ class Programs:
                     status = None
                     _kill(process)
             seconds = time.perf_counter() - began
-            text = _end_of(said)
+            with said.open("rb") as end:  # a character has at most 4 bytes
+                end.seek(max(said.stat().st_size - 4 * _SHOWN, 0))
+                text = end.read().decode("utf-8", "replace").strip()[-_SHOWN:]
             if status is None:
                 assert self._limit is not None
                 return RunFault(f"over the time limit of {self._limit:g} s", "", text)
@@ -184,49 +208,3 @@ def _kill(process: "subprocess.Popen[bytes]") -> None:
                 os.killpg(process.pid, signal.SIGKILL)
             else:
                 process.kill()
-
-
-def _words_of(command: str) -> list[str]:
-    """The words of a command, which are split as by a shell; ValueError without its places."""
-    try:
-        words = shlex.split(command)
-    except ValueError as error:
-        raise ValueError(f"--estimator: {command!r}: {error}") from error
-    for place in PLACES:
-        if not any(place in word for word in words):
-            raise ValueError(
-                f"--estimator: expected a command with {PLACES[0]} and {PLACES[1]}, as "
-                f"'./my_filter {{run}} {{estimate}}', got {command!r}"
-            )
-    if shutil.which(words[0]) is None:
-        raise ValueError(f"--estimator: {words[0]}: there is no such program")
-    return words
-
-
-def _checksums(words: Sequence[str]) -> dict[str, str]:
-    """The SHA-256 of each file that a command names, as its program or a script of it."""
-    checksums = {}
-    for word, path in {words[0]: shutil.which(words[0]) or "", **{w: w for w in words[1:]}}.items():
-        if Path(path).is_file():
-            with open(path, "rb") as file:
-                checksums[word] = hashlib.file_digest(file, "sha256").hexdigest()
-    return checksums
-
-
-def _changed(earlier: object, files: Mapping[str, str]) -> list[str]:
-    """The files whose checksum is not the earlier one."""
-    checksums = earlier if isinstance(earlier, dict) else {}
-    return [name for name, checksum in files.items() if checksums.get(name) != checksum]
-
-
-def _end_of(said: Path) -> str:
-    """The last characters of what a program wrote."""
-    with said.open("rb") as file:
-        file.seek(max(said.stat().st_size - 4 * _SHOWN, 0))  # 4 bytes a character at most
-        return file.read().decode("utf-8", "replace").strip()[-_SHOWN:]
-
-
-def _with_places(word: str, places: tuple[Path, Path]) -> str:
-    """A word of a command, with the folders of a run in it."""
-    folders = dict(zip(PLACES, map(str, places), strict=True))
-    return re.sub("|".join(map(re.escape, PLACES)), lambda match: folders[match[0]], word)

@@ -7,6 +7,7 @@ import numpy as np
 
 from jaxslam._cli import cache
 from jaxslam._cli.common import add_out, summary_table
+from jaxslam.core._table import Row, Table, text_of
 from jaxslam.datasets import Dataset, DatasetFit, fit, table
 from jaxslam.datasets._landmark_logs.table_settings import FITTED, fitted_text
 from jaxslam.results._files import (
@@ -15,7 +16,6 @@ from jaxslam.results._files import (
     check_writable,
     json_number,
     json_text,
-    text_table,
     versions,
     write_files,
 )
@@ -136,30 +136,26 @@ def _summary(data: Dataset, result: DatasetFit) -> Json:
 def _table(data: Dataset, result: DatasetFit) -> str:
     """The parameters before and after with their errors, the likelihood, and notes."""
     estimate = result.noise_fit
-    lines = [["", "before", "after", "std. error", "robust"]]
+    rows = []
     for i, name in enumerate(estimate.names):
+        limit = estimate.upper.get(name)
         errors = estimate.error[i], estimate.robust_error[i]
-        shown = [
-            f"{e:.2g}" if np.isfinite(e) and name not in estimate.upper else "-" for e in errors
-        ]
-        value = (
-            f"< {estimate.upper[name]:.2g}"
-            if name in estimate.upper
-            else f"{estimate.parameters[i]:.4g}"
-        )
-        lines.append([name, f"{estimate.start[i]:.4g}", value, *shown])
+        value = f"{estimate.parameters[i]:.4g}" if limit is None else f"< {limit:.2g}"
+        shown = [f"{e:.2g}" if np.isfinite(e) and limit is None else None for e in errors]
+        rows.append(Row(name, [f"{estimate.start[i]:.4g}", value, *shown]))
     before, after = estimate.log_likelihood
-    lines.append(["log-likelihood", f"{before:.1f}", f"{after:.1f}", "", ""])
+    rows.append(Row("log-likelihood", [f"{before:.1f}", f"{after:.1f}", "", ""]))
     before, after = estimate.nis_per_dof
-    lines.append(["NIS / dof", f"{before:.3f}", f"{after:.3f}", "", ""])
+    rows.append(Row("NIS / dof", [f"{before:.3f}", f"{after:.3f}", "", ""]))
     lag, band = result.autocorrelation
     if np.isfinite(lag):
-        lines.append(["autocorrelation", "", f"{lag:.3f}", f"(± {band:.2g})", ""])
+        rows.append(Row("autocorrelation", ["", f"{lag:.3f}", f"(± {band:.2g})", ""]))
+    parameters = Table(["", "before", "after", "std. error", "robust"], rows)
     head = f"{data.name}: {data.steps:,} rows, {result.used:,} measurements used"
     if result.left_out:
         counts = (f"{count:,} {name}" for name, count in result.left_out.items())
         head += f", others: {', '.join(counts)}"
-    return "\n".join([head, *map(str.rstrip, text_table(lines)), "", *_notes(result)])
+    return "\n".join([head, text_of(parameters), "", *_notes(result)])
 
 
 def _notes(result: DatasetFit) -> list[str]:

@@ -9,10 +9,11 @@ from jaxslam._cli.common import SUMMARY, check_out, write_results
 from jaxslam.consistency import RecordingScores, judge_recording
 from jaxslam.consistency._intervals import Average
 from jaxslam.consistency._recording import ALIGNMENTS, COMPONENTS, FRAMES
+from jaxslam.core._table import csv_text
 from jaxslam.core.validation import or_none, positive, require
 from jaxslam.datasets import RecordedPath, recorded_path
 from jaxslam.results._campaign_files import formats_of_figures
-from jaxslam.results._files import Files, Json, csv_text, json_number, json_text, versions
+from jaxslam.results._files import Files, Json, json_number, json_text, versions
 
 DRAWING = "errors"
 

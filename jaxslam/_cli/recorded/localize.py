@@ -114,7 +114,16 @@ def run_localization(log: LaserLog, options: argparse.Namespace) -> laser_log.Jo
                 f"--start: the pose ({x:g} m, {y:g} m, {np.rad2deg(heading):g}°) is off the map "
                 f"{options.map}"
             )
-    raw, odometry = _odometry(log)
+    # Laser odometry, if the log has none, or one that jumps.
+    is_logged = len(log.time) == 1 or bool(log.odometry_known[1:].any())
+    jumps = int(odometry_jumps(log.raw, log.time).sum())
+    raw, odometry = log.raw, "of the log"
+    if not is_logged:
+        odometry = "laser odometry, since the log has none"
+    elif jumps:
+        odometry = f"laser odometry, since that of the log jumps {jumps} times"
+    if jumps or not is_logged:
+        raw = laser_slam.solve(log).odometry
     result = _run_particles(log, grid, pose, raw, options)
     path = result.path
     fit = share_as_predicted(grid, np.asarray(path.pose)[-LAST_SCANS:], log)
@@ -140,21 +149,6 @@ def run_localization(log: LaserLog, options: argparse.Namespace) -> laser_log.Jo
         "trajectory.tum": report.trajectory_tum(log.time, path),
     }
     return laser_log.Job(summary, files, drawings={"localization": draw})
-
-
-def _odometry(log: LaserLog) -> tuple[Float[np.ndarray, "K 3"], str]:
-    """The path of the odometry to use, and its source in words.
-
-    It is laser odometry if the log has none, or one that jumps.
-    """
-    is_logged = len(log.time) == 1 or bool(log.odometry_known[1:].any())
-    jumps = int(odometry_jumps(log.raw, log.time).sum())
-    if is_logged and not jumps:
-        return log.raw, "of the log"
-    odometry = laser_slam.solve(log).odometry
-    if not is_logged:
-        return odometry, "laser odometry, since the log has none"
-    return odometry, f"laser odometry, since that of the log jumps {jumps} times"
 
 
 def _run_particles(

@@ -36,12 +36,13 @@ from jaxslam._cli.recorded.filter_choice import (
 from jaxslam._cli.recorded.filter_run import FilterRun, run_filter
 from jaxslam.consistency import ModelCheck
 from jaxslam.consistency._measures.counts import count_label
-from jaxslam.core.protocols import Filter
+from jaxslam.core.protocols import POSE, Filter
 from jaxslam.core.types import Estimate
 from jaxslam.core.validation import require
 from jaxslam.datasets import READERS, Dataset
 from jaxslam.datasets._evaluation import Evaluation
 from jaxslam.datasets._landmark_logs.table_settings import METHODS
+from jaxslam.linearize._first_order import nominal_path
 from jaxslam.results import report
 from jaxslam.results._campaign_files import FORMATS, formats_of_figures
 from jaxslam.results._files import Files, Json, json_text, versions
@@ -180,7 +181,20 @@ def print_summary(summary: Json, runs: Mapping[str, FilterRun]) -> None:
         return
     of_data = {key: value for key, value in summary.items() if key != "filters"}
     print(summary_table({"": of_data}), end="\n\n")
-    print(summary_table({name: _flatten(run.summary) for name, run in runs.items()}))
+    columns = {}
+    for name, run in runs.items():
+        # A row has one value: one row a status that occurs, one a coordinate.
+        status, final = run.summary["status"], run.summary["final pose"]
+        assert isinstance(status, dict)
+        assert isinstance(final, list)
+        rows = {f"{COUNT}{count_label(word)}": count for word, count in status.items() if count}
+        rows |= {
+            key: value
+            for key, value in run.summary.items()
+            if key not in ("status", "final pose", "notes")
+        }
+        columns[name] = rows | {f"final {c}": x for c, x in zip(POSE, final, strict=True)}
+    print(summary_table(columns))
     for name, run in runs.items():
         if notes := run.summary.get("notes"):
             print(summary_table({"": {name: notes}}))
@@ -220,18 +234,6 @@ def write_runs(
     return write_results(folder, files, drawings, FILMS)
 
 
-def _flatten(summary: Json) -> Json:
-    """The summary as rows of one value: one per status that occurs, one per coordinate."""
-    status, final = summary["status"], summary["final pose"]
-    assert isinstance(status, dict)
-    assert isinstance(final, list)
-    counts = {f"{COUNT}{count_label(name)}": count for name, count in status.items() if count}
-    names = ("x [m]", "y [m]", "theta [rad]")
-    pose = {f"final {n}": value for n, value in zip(names, final, strict=True)}
-    rows = {key: summary[key] for key in summary if key not in ("status", "final pose", "notes")}
-    return counts | rows | pose
-
-
 def _figure(data: Dataset, runs: Mapping[str, FilterRun], formats: tuple[str, ...]) -> Files:
     """The figure of the map: the first filter with ellipses and truth, others without."""
     from jaxslam.results import plot  # matplotlib is slow to load
@@ -239,14 +241,8 @@ def _figure(data: Dataset, runs: Mapping[str, FilterRun], formats: tuple[str, ..
 
     (name, first), *others = runs.items()
     evaluation = first.evaluation
-    nominal = jnp.zeros(len(data.motion.noises))
-
-    def step(pose: jax.Array, control: jax.Array) -> tuple[jax.Array, jax.Array]:
-        pose = data.motion.step(pose, control, nominal)
-        return pose, pose
-
-    drive = jax.jit(lambda pose, controls: jax.lax.scan(step, pose, controls)[1])
-    robots = np.asarray(drive(jnp.asarray(data.pose), jnp.asarray(data.log.control)))
+    start, controls = jnp.asarray(data.pose), jnp.asarray(data.log.control)
+    robots = np.asarray(nominal_path(data.motion, start, controls))
     figure = plot.map_figure(
         _path_with_map(first),
         true_points=evaluation.points,

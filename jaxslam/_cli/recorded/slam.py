@@ -13,6 +13,7 @@ from jaxslam._cli.recorded import laser_log
 from jaxslam._cli.recorded.memory import memory_returned, trim
 from jaxslam.consistency import metrics
 from jaxslam.consistency.campaign._progress import Progress
+from jaxslam.core._table import csv_text
 from jaxslam.core.types import Estimate
 from jaxslam.core.validation import InvalidField
 from jaxslam.datasets import LaserLog, relation_file
@@ -23,7 +24,7 @@ from jaxslam.laser.laser_slam import LoopOutcome, Settings, Solved
 from jaxslam.laser.laser_slam._log_map import growing_maps
 from jaxslam.math.stats import chi2_quantile
 from jaxslam.results import report
-from jaxslam.results._files import Files, Json, csv_text
+from jaxslam.results._files import Files, Json
 
 if TYPE_CHECKING:  # Matplotlib is slow to load
     from jaxslam.results.plot import Film
@@ -65,7 +66,18 @@ def run_slam(log: LaserLog, options: argparse.Namespace) -> laser_log.Job:
     # Before the work, so that a wrong file is refused at once.
     relations_of_log = None if options.relations is None else read_relations(options.relations, log)
     settings = Settings(resolution=options.resolution)
-    solved = _solve(log, settings)
+    with memory_returned(), Progress(f"{log.name}, reading", "scans") as first:
+        bars = {"": first}
+
+        def report_stage(stage: str, done: int, of: int) -> None:
+            if stage not in bars:
+                unit = "candidates" if stage == "loop closing" else "scans"
+                bars[stage] = Progress(f"{log.name}, {stage}", unit)
+            bars[stage](done, of)
+            if done == of:
+                trim()
+
+        solved = laser_slam.solve(log, settings, progress=report_stage)
     coarser = float(solved.map.resolution) > 1.001 * settings.resolution
     reference = log.corrected if log.placed else None
     files, drawings = result_files(solved), figures(solved, options.figures, reference)
@@ -96,22 +108,6 @@ def run_slam(log: LaserLog, options: argparse.Namespace) -> laser_log.Job:
         **scores,
     }
     return laser_log.Job(summary, files, text, {"relations": entry}, drawings)
-
-
-def _solve(log: LaserLog, settings: Settings) -> Solved:
-    """Solve, with a progress bar for each stage."""
-    with memory_returned(), Progress(f"{log.name}, reading", "scans") as first:
-        bars = {"": first}
-
-        def report_stage(stage: str, done: int, of: int) -> None:
-            if stage not in bars:
-                unit = "candidates" if stage == "loop closing" else "scans"
-                bars[stage] = Progress(f"{log.name}, {stage}", unit)
-            bars[stage](done, of)
-            if done == of:
-                trim()
-
-        return laser_slam.solve(log, settings, progress=report_stage)
 
 
 def result_files(solved: Solved) -> Files:

@@ -259,6 +259,17 @@ def sum_up(
     finished, limit, summaries = summaries_of(tallies)
     for name, doubt in precision_doubts(plan, tallies, limit.dtype, compare).items():
         summaries[name] = replace(summaries[name], doubts=(*summaries[name].doubts, doubt))
+    # A filter that an exact sensor left without a covariance.
+    dropped = {name: summary.counts.get("singular", 0) for name, summary in summaries.items()}
+    exact = without_noise(scenario) if any(dropped.values()) else ""
+    for name, count in dropped.items():
+        if exact and count:
+            doubt = (
+                f"the sensor has {exact} without noise, so innovation covariances were singular: "
+                f"{count:,} measurements were dropped and others weighted by rounding errors; give "
+                "the sensor a small noise"
+            )
+            summaries[name] = replace(summaries[name], doubts=(*summaries[name].doubts, doubt))
     steps = max(scenario.steps, 1)
     return Campaign(
         scenario=scenario.name,
@@ -268,7 +279,7 @@ def sum_up(
         runs=finished,
         dtype=str(limit.dtype),
         divergence_limit=float(limit),
-        filters=_qualify(summaries, scenario),
+        filters=summaries,
         seconds=seconds,
         compile_seconds=work.compile_seconds,
         step_seconds={name: seconds / steps for name, seconds in work.run_seconds().items()},
@@ -319,25 +330,3 @@ def move_to_start(
             return scenario, filters, None
         near_filters[name] = near_filter
     return near, near_filters, origin
-
-
-def _qualify(summaries: dict[str, Summary], scenario: World) -> dict[str, Summary]:
-    """The summaries, with a doubt on filters that an exact sensor left without a covariance."""
-    dropped = {name: summary.counts.get("singular", 0) for name, summary in summaries.items()}
-    exact = without_noise(scenario) if any(dropped.values()) else ""
-    if not exact:
-        return summaries
-    return {
-        name: replace(
-            summary,
-            doubts=(
-                *summary.doubts,
-                f"the sensor has {exact} without noise, so innovation covariances were singular: "
-                f"{dropped[name]:,} measurements were dropped and others weighted by rounding "
-                "errors; give the sensor a small noise",
-            ),
-        )
-        if dropped[name]
-        else summary
-        for name, summary in summaries.items()
-    }

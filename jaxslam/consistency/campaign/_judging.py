@@ -255,6 +255,7 @@ class _Judgement:
             [outcome.estimate for outcome in outcomes],
             jax.tree.map(lambda *leaves: np.stack(leaves), *truths),
             shape,
+            self.plan.scenario.motion.state,
             self.plan.scenario.sensor,
             self.plan.devices[0],
             self.plan.wide,
@@ -279,7 +280,9 @@ class _Judgement:
                 for i in np.flatnonzero(scores.finite & (scores.sums[name] > 0))
             ]
             if numbers:
-                doubts.append(f"its covariance is {fault_of_cov} in {_runs_text(numbers)}")
+                listed = ", ".join(map(str, numbers[:20])) + ", …" * (len(numbers) > 20)
+                plural = "s" * (len(numbers) > 1)
+                doubts.append(f"its covariance is {fault_of_cov} in run{plural} {listed}")
         faults = {reason: tuple(numbers) for reason, numbers in by_reason.items()}
         return replace(summary, doubts=tuple(doubts), faults=faults)
 
@@ -339,12 +342,6 @@ def _judge_pieces(
             for name, judgement in judged.items():
                 judgement.score_piece(outcomes[name], shape)
     return judged
-
-
-def _runs_text(numbers: Sequence[int]) -> str:
-    """The numbers of some runs."""
-    listed = ", ".join(map(str, numbers[:20])) + ", …" * (len(numbers) > 20)
-    return f"run{'s' * (len(numbers) > 1)} {listed}"
 
 
 def _check(

@@ -15,7 +15,7 @@ import numpy as np
 from jax.sharding import NamedSharding
 from jaxtyping import Float, Int, PyTree
 
-from jaxslam._rounding import SAME, Rounding, rounding_of
+from jaxslam._rounding import SAME, rounding_of
 from jaxslam.consistency._measures.nees import block_nees, pose_error
 from jaxslam.consistency._tally import Tally
 from jaxslam.consistency.campaign._block import CampaignPlan
@@ -31,7 +31,6 @@ from jaxslam.core._record import as_record
 from jaxslam.core.protocols import Candidate
 from jaxslam.core.types import Status
 from jaxslam.math._arrays import float64
-from jaxslam.simulation._worlds import World
 
 RUNS = 16
 """Largest number of runs that are filtered again: a block on a CPU, whose programs are there."""
@@ -44,10 +43,16 @@ def precision_doubts(
 
     dtype: of the runs. compare: whether runs may be filtered again.
     """
-    least, doubts = least_noise(plan.scenario), {}
+    scenario, doubts = plan.scenario, {}
+    least = least_noise(scenario)
+    start = np.asarray(scenario.pose, np.float64)[None, :2]
+    points = np.asarray(scenario.landmarks, np.float64)[:, :2]
+    places = np.concatenate([start, np.pad(points, [(0, 0), (0, 2 - points.shape[1])])])
+    start_cov = np.asarray(scenario.pose_cov, np.float64)[None, :3, :3]
     for name, candidate in plan.filters.items():
         tally = tallies[name]
-        rounding = _rounding(plan.scenario, candidate, tally, dtype, least)
+        covs = np.concatenate([start_cov, tally.snapshots()[1].reshape(-1, 3, 3)])
+        rounding = rounding_of(candidate, dtype, covs, places, least)
         singular = int(tally.sums["singular"])
         suspect = rounding.may_decide or singular or not tally.flags("finite").all()
         doubt = rounding.doubt
@@ -61,18 +66,6 @@ def precision_doubts(
         if doubt:
             doubts[name] = doubt
     return doubts
-
-
-def _rounding(
-    scenario: World, candidate: Candidate, tally: Tally, dtype: np.dtype, least: float
-) -> Rounding:
-    """The rounding of a filter's runs, from its covariances at some steps."""
-    start = np.asarray(scenario.pose, np.float64)[None, :2]
-    points = np.asarray(scenario.landmarks, np.float64)[:, :2]
-    places = np.concatenate([start, np.pad(points, [(0, 0), (0, 2 - points.shape[1])])])
-    start_cov = np.asarray(scenario.pose_cov, np.float64)[None, :3, :3]
-    covs = np.concatenate([start_cov, tally.snapshots()[1].reshape(-1, 3, 3)])
-    return rounding_of(candidate, dtype, covs, places, least)
 
 
 class _Runs(NamedTuple):
@@ -90,38 +83,39 @@ def _difference(plan: CampaignPlan, candidate: Candidate, numbers: np.ndarray) -
     """The run of a filter that differs most between float32 and float64, as a sentence; "" where
     none does by more than `SAME`, None where they cannot be compared: a filter that draws random
     numbers, or computes in one precision alone."""
+    size = min(RUNS, plan.block)
+    compared = numbers[:size]
+    filled = np.resize(compared, size)  # a block, for which there are programs, repeats its runs
     devices = tuple(plan.devices[:1])
-    wanted = numbers[: min(RUNS, plan.block)]
-    run_numbers = np.resize(wanted, min(RUNS, plan.block))
     everywhere = NamedSharding(mesh_of(devices), spec(None))
 
-    def filter_again(draws: Draws | None, key: jax.Array) -> tuple[_Runs, Draws]:
-        world, method = jax.device_put((plan.scenario, as_record(candidate)), everywhere)
-        compiled, runs = programs(devices, plan.dtype), run_numbers.astype(jnp.result_type(int))
-        campaign_key = jax.device_put(plan.key, everywhere)
-        if draws is None:
-            draws = compiled.draw(world, campaign_key, runs)
-        results: FilterResults = compiled.drive(
-            world, method, jax.device_put(key, everywhere), runs, *draws
+    def filter_again(draws: Draws, key: jax.Array) -> _Runs:
+        """The runs in the precision that is set where this is called."""
+        fixed = plan.scenario, as_record(candidate), key
+        results: FilterResults = programs(devices, plan.dtype).drive(
+            *jax.device_put(fixed, everywhere), filled.astype(jnp.result_type(int)), *draws
         )
         estimate, info = results.estimate, results.info
         of_estimate = estimate.pose, estimate.pose_cov, results.chart_error
         parts: PyTree = (*of_estimate, info.status, info.nis, info.dof)
-        parts, draws = jax.device_get((parts, draws))
-        return _Runs(*parts), draws
+        return _Runs(*jax.device_get(parts))
 
-    single, draws = filter_again(None, plan.key)
+    world, key = jax.device_put((plan.scenario, plan.key), everywhere)
+    draws = programs(devices, plan.dtype).draw(world, key, filled.astype(jnp.result_type(int)))
+    single = filter_again(draws, plan.key)
+    draws = jax.device_get(draws)
     try:
         with float64():
             wide = jax.tree.map(
                 lambda leaf: leaf.astype(float) if leaf.dtype == np.float32 else leaf, draws
             )
-            double, _ = filter_again(wide, plan.key)
+            double = filter_again(wide, plan.key)
             scores = _scores((single, double), np.asarray(draws[0].pose))
-            gaps = np.stack([_gap(*pair) for pair in scores.values()])[:, : len(wanted)]
+            gaps = np.stack([_gap(*pair) for pair in scores.values()])[:, : len(compared)]
             if not gaps.max() > SAME:
                 return ""
-            another, _ = filter_again(wide, jax.random.fold_in(plan.key, 0))
+            # With another key only a filter that draws random numbers computes something else.
+            another = filter_again(wide, jax.random.fold_in(plan.key, 0))
     except Exception:  # a user's filter that computes in float32 alone
         return None
     if not np.array_equal(double.pose, another.pose, equal_nan=True):
@@ -132,7 +126,7 @@ def _difference(plan: CampaignPlan, candidate: Candidate, numbers: np.ndarray) -
         for name, (a, b) in scores.items()
         if np.isfinite([a[run], b[run]]).any()
     ]
-    return f"run {wanted[run]} has, in float32 and in float64, {', '.join(pairs)}"
+    return f"run {compared[run]} has, in float32 and in float64, {', '.join(pairs)}"
 
 
 def _scores(
@@ -146,19 +140,16 @@ def _scores(
         for runs in both
     ]
     regular = nees[0].regular & nees[1].regular
-    fused = [runs.status == Status.FUSED for runs in both]
-    with np.errstate(all="ignore"):
-        return {
-            "pose NEES": [
-                np.where(regular, value, 0.0).sum(axis=0) / regular.sum(axis=0) for value, _ in nees
-            ],
-            "NIS/dof": [
-                np.where(used, runs.nis, 0.0).sum(axis=(0, 2), dtype=np.float64)
-                / runs.dof.sum(axis=(0, 2))
-                for used, runs in zip(fused, both, strict=True)
-            ],
-            "measurements used": [used.sum(axis=(0, 2)).astype(np.float64) for used in fused],
-        }
+    scores: dict[str, list[np.ndarray]] = {"pose NEES": [], "NIS/dof": [], "measurements used": []}
+    with np.errstate(all="ignore"):  # without a step, or a measurement, the number is NaN
+        for runs, (value, _) in zip(both, nees, strict=True):
+            used = runs.status == Status.FUSED
+            nis = np.where(used, runs.nis, 0.0).sum(axis=(0, 2), dtype=np.float64)
+            average = np.where(regular, value, 0.0).sum(axis=0) / regular.sum(axis=0)
+            scores["pose NEES"].append(average)
+            scores["NIS/dof"].append(nis / runs.dof.sum(axis=(0, 2)))
+            scores["measurements used"].append(used.sum(axis=(0, 2)).astype(np.float64))
+    return scores
 
 
 def _gap(a: Float[np.ndarray, "R"], b: Float[np.ndarray, "R"]) -> Float[np.ndarray, "R"]:

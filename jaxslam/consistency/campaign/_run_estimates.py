@@ -13,7 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int, PyTree
 
-from jaxslam.consistency._measures.measure import RunStatistics
+from jaxslam.consistency._measures.further import measures_of_state
+from jaxslam.consistency._measures.measure import Measure, RunStatistics
 from jaxslam.consistency._run_scores import LAGS, Score, score
 from jaxslam.consistency.campaign._block import select_steps
 from jaxslam.consistency.campaign._block_programs import statistics_program
@@ -24,6 +25,7 @@ from jaxslam.core.validation import InvalidField
 
 MISSING, EARLY, GAPS = "missing", "ends early", "has no estimate at some steps"
 NOT_FINITE = "not finite"
+NO_COVARIANCE = "has no covariance beside the pose"
 DEGREES = "heading in degrees"
 TIMES = "has times that are not in the truth"
 """Reasons for which a run is not judged."""
@@ -68,6 +70,10 @@ class RunEstimate(NamedTuple):
     tag of a landmark is its row in the map of the world, -1 for a place without a landmark."""
     innovations: Any = None
     """`Innovations`, or a tuple of their first fields, for NIS, whiteness and log-likelihood"""
+    further: Any = None
+    """(K, E) what the robot has beside its pose, `Motion.state[3:]` of the world, for its NEES"""
+    further_covs: Any = None
+    """(K, E, E), beside `further`"""
 
 
 class RunFault(NamedTuple):
@@ -86,9 +92,11 @@ def as_estimate(value: object) -> RunEstimate:
 
     Raises InvalidField on anything else.
     """
+    further = further_covs = None
     if hasattr(value, "poses") and hasattr(value, "covs"):
         fields = value.poses, value.covs, getattr(value, "maps", None)
         innovations = getattr(value, "innovations", None)
+        further, further_covs = (getattr(value, f, None) for f in ("further", "further_covs"))
     elif isinstance(value, tuple) and len(value) == 2:
         fields, innovations = (*value, None), None
     else:
@@ -128,7 +136,12 @@ def as_estimate(value: object) -> RunEstimate:
             nis,
             log_likelihood,
         )
-    return RunEstimate(poses, covs, maps, innovations)
+    if (further is None) != (further_covs is None):
+        raise InvalidField("further", "expected both or none of further and further_covs")
+    if further is not None:
+        further = _array("further", further, (len(poses), "E"))
+        further_covs = _array("further_covs", further_covs, (len(poses), *[further.shape[1]] * 2))
+    return RunEstimate(poses, covs, maps, innovations, further, further_covs)
 
 
 def _array(field: str, value: object, shape: tuple[int | str, ...]) -> np.ndarray:
@@ -171,12 +184,15 @@ class RunShape(NamedTuple):
     landmarks: int
     stride: int
     """k: steps k, 2k, …, T are judged"""
+    further: int
+    """E, the numbers of the robot beside its pose"""
 
 
 def shape_of(log: Log, truth: Truth, stride: int) -> RunShape:
     """The sizes of a run, from its log and truth."""
     steps, places, size = np.shape(log.scan.z)
-    return RunShape(steps, places, size, len(truth.landmarks), stride)
+    further = 0 if truth.further is None else np.shape(truth.further)[1]
+    return RunShape(steps, places, size, len(truth.landmarks), stride, further)
 
 
 def select_rows(
@@ -195,15 +211,23 @@ def select_rows(
         if maps is not None and maps[2].ndim == 2:
             maps = tuple(part[at] for part in maps)
         estimate = estimate._replace(poses=estimate.poses[at], covs=estimate.covs[at], maps=maps)
+        if estimate.further is not None:
+            beside = estimate.further[at], estimate.further_covs[at]
+            estimate = estimate._replace(further=beside[0], further_covs=beside[1])
     elif rows > expected:
         counts = f"{steps}" if stride == 1 else f"{steps} or {expected}"
         raise InvalidField("poses", f"expected {counts} rows, got {rows}")
     if rows < expected:
         return estimate, RunFault(EARLY, f"{rows} of {expected} rows")
     _check_identities(estimate, shape)
+    if estimate.further is not None and estimate.further.shape[1] != shape.further:
+        reason = f"expected {shape.further} numbers a row, as the robot has beside its pose, got "
+        raise InvalidField("further", f"{reason}{estimate.further.shape[1]}")
     for part, values in (
         ("poses", estimate.poses),
         ("covs", estimate.covs),
+        ("further", () if estimate.further is None else estimate.further),
+        ("further_covs", () if estimate.further_covs is None else estimate.further_covs),
         ("maps", estimate.maps or ()),
         ("innovations", estimate.innovations or ()),
     ):
@@ -212,6 +236,10 @@ def select_rows(
             if array is not None and not np.isfinite(array).all():
                 row = int(np.argwhere(~np.isfinite(array))[0][0]) if array.ndim else 0
                 return estimate, RunFault(NOT_FINITE, f"{part}, first at row {row}")
+    if estimate.further_covs is not None:
+        improper = ~_are_semidefinite(estimate.further_covs)
+        if improper.any():
+            return estimate, RunFault(NO_COVARIANCE, f"first at row {int(np.argmax(improper))}")
     true_heading = np.asarray(truth.pose, np.float64)[stride - 1 :: stride, 2]
     if _is_in_degrees(estimate.poses[:, 2], true_heading):
         largest = float(np.abs(estimate.poses[:, 2]).max())
@@ -273,7 +301,8 @@ def _check_range(field: str, values: np.ndarray, least: int, end: int) -> None:
 
 def trace_of(estimate: RunEstimate | None, shape: RunShape) -> tuple[Estimate, Info]:
     """The estimate, and the info, of one run at each of its T steps; zero where there is none."""
-    steps, places, size, landmarks, stride = shape
+    steps, places, size, landmarks, stride, beside = shape
+    further, further_cov = np.zeros((steps, beside)), np.zeros((steps, beside, beside))
     pose, cov = np.zeros((steps, 3)), np.zeros((steps, 3, 3))
     points, point_covs = np.zeros((steps, landmarks, 2)), np.zeros((steps, landmarks, 2, 2))
     alive = np.zeros((steps, landmarks), bool)
@@ -283,6 +312,8 @@ def trace_of(estimate: RunEstimate | None, shape: RunShape) -> tuple[Estimate, I
     if estimate is not None:
         judged = np.arange(stride - 1, steps, stride)
         pose[judged], cov[judged] = estimate.poses, estimate.covs
+        if estimate.further is not None:
+            further[judged], further_cov[judged] = estimate.further, estimate.further_covs
         if estimate.maps is not None:
             means, map_covs, tags = estimate.maps
             is_final = tags.ndim == 1
@@ -317,31 +348,47 @@ def trace_of(estimate: RunEstimate | None, shape: RunShape) -> tuple[Estimate, I
     tag = np.where(alive, np.arange(landmarks), -1)
     # In the order of `Info`, whose fields are declared as JAX arrays.
     numbers: PyTree = nis, np.where(fused, size, 0), nu, S, slot, status, log_likelihood
-    return Estimate(pose, cov, points, point_covs, alive, tag), Info(*numbers)
+    of_robot: PyTree = (further, further_cov) if beside else (None, None)
+    return Estimate(pose, cov, points, point_covs, alive, tag, *of_robot), Info(*numbers)
 
 
 def _are_definite(covs: Float[np.ndarray, "J Z Z"]) -> np.ndarray:
     """Whether innovation covariances are symmetric, to a millionth, and positive definite."""
+    least, is_symmetric = _least_eigenvalues(covs)
+    # 100 n eps, as in `block_nees`.
+    return np.asarray(is_symmetric & (least > 100 * covs.shape[1] * np.finfo(float).eps))
+
+
+def _are_semidefinite(covs: Float[np.ndarray, "K E E"]) -> np.ndarray:
+    """Whether covariances are symmetric and have no negative eigenvalue, to a millionth."""
+    least, is_symmetric = _least_eigenvalues(covs)
+    return np.asarray(is_symmetric & (least >= -1e-6))
+
+
+def _least_eigenvalues(covs: Float[np.ndarray, "J Z Z"]) -> tuple[np.ndarray, np.ndarray]:
+    """The least eigenvalue of matrices scaled to a unit diagonal, and whether they are symmetric,
+    to a millionth."""
     size = np.abs(np.diagonal(covs, axis1=1, axis2=2))
     root = np.sqrt(np.where(size > 0, size, 1.0))
     scaled = covs / root[:, :, None] / root[:, None, :]
-    symmetric = np.abs(scaled - np.swapaxes(scaled, 1, 2)).max(axis=(1, 2)) <= 1e-6
-    # 100 n eps, as in `block_nees`.
+    is_symmetric = np.abs(scaled - np.swapaxes(scaled, 1, 2)).max(axis=(1, 2)) <= 1e-6
     least = np.linalg.eigvalsh((scaled + np.swapaxes(scaled, 1, 2)) / 2)[:, 0]
-    return np.asarray(symmetric & (least > 100 * covs.shape[1] * np.finfo(float).eps))
+    return least, is_symmetric
 
 
 def score_estimates(
     estimates: Sequence[RunEstimate | None],
     truth: Truth,
     shape: RunShape,
+    state: tuple[str, ...],
     sensor: Sensor,
     device: jax.Device,
     block: int,
 ) -> Score:
     """The scores of the estimates of R runs; a run without one is not finite.
 
-    truth: (R, …), float64. block: R or more, for which statistics are compiled once.
+    truth: (R, …), float64. state: of the robot. block: R or more, for which statistics are compiled
+    once.
     """
     runs, stride = len(estimates), shape.stride
     # What a measurement is truly of is the identity of a slot by the info of our filters: maps of
@@ -352,8 +399,12 @@ def score_estimates(
     traces = [trace_of(estimate, shape) for estimate in estimates]
     estimate, info = jax.tree.map(lambda *leaves: np.stack(leaves), *traces)
     has_innovations = bool((info.status != Status.EMPTY).any())
-    if has_innovations or estimate.alive.any():
-        statistics = _statistics(estimate, info, truth, sensor, device, block)
+    has_further = any(e is not None and e.further is not None for e in estimates)
+    if not has_further:
+        estimate = estimate._replace(further=None, further_cov=None)
+    if has_innovations or estimate.alive.any() or has_further:
+        of_state = measures_of_state(state) if has_further else ()
+        statistics = _statistics(estimate, info, truth, of_state, sensor, device, block)
     else:
         by_step = np.zeros((runs, shape.steps))
         # In the order of `RunStatistics`, whose fields are declared as JAX arrays.
@@ -388,12 +439,18 @@ def score_estimates(
 
 
 def _statistics(
-    estimate: Estimate, info: Info, truth: Truth, sensor: Sensor, device: jax.Device, block: int
+    estimate: Estimate,
+    info: Info,
+    truth: Truth,
+    measures: tuple[Measure, ...],
+    sensor: Sensor,
+    device: jax.Device,
+    block: int,
 ) -> RunStatistics:
     """`run_statistics` of each run, by the program of a campaign, padded to a block."""
     runs = len(estimate.pose)
     which = np.minimum(np.arange(block), runs - 1)
-    program = statistics_program((device,), ())
+    program = statistics_program((device,), measures)
 
     def in_default_dtype(leaf: np.ndarray) -> np.ndarray:
         # As JAX is set: float32 without 64-bit types.

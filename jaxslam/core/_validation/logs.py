@@ -41,33 +41,32 @@ def log_of(control_size: int, measurement_size: int, parts: tuple[int, ...] = ()
         dtype = jnp.promote_types(jnp.result_type(control), jnp.result_type(z))
         if dtype not in (jnp.float32, jnp.float64):
             raise InvalidField("", f"expected control, scan.z of float32 or float64, got {dtype}")
-        if is_concrete(log):
-            _check_values(log, parts)
+        if not is_concrete(log):
+            return log
+
+        # Numbers are finite and of a size to compute with, and no tag repeats.
+        mask, tags = np.asarray(valid), np.asarray(tag)
+        most = largest(control, z)
+        for field, noun, values, used, advice in (
+            ("control", "a control", control, np.ones(steps, bool), "correct or omit the row"),
+            ("scan.z", "a valid measurement", z, mask, "set log.scan.valid to False there"),
+        ):
+            size = np.abs(np.asarray(values, np.float64)).max(axis=-1, initial=0.0)
+            _refuse(field, used & ~np.isfinite(size), f"{noun} is not finite", advice)
+            _refuse(field, used & (size > most), f"{noun} is beyond ±{most:.2g}", advice)
+        _refuse("scan.tag", mask & (tags < -1), "a tag is below -1")
+        _refuse("scan.tag", mask & (tags > np.iinfo(np.int32).max), "a tag is beyond int32")
+        # Unknown tags become -1, -2, … of each row, so that they repeat nothing.
+        named = np.where(mask & (tags >= 0), tags, -1 - np.arange(places))
+        for part in (
+            np.split(named, np.cumsum(parts)[:-1].astype(int), axis=1) if parts else (named,)
+        ):
+            ordered = np.sort(part, axis=1)
+            repeats = (ordered[:, 1:] == ordered[:, :-1]).any(axis=1)
+            _refuse("scan.tag", repeats, "a tag repeats within the scan")
         return log
 
     return check
-
-
-def _check_values(log: Log, parts: tuple[int, ...]) -> None:
-    """Check that numbers are finite and of a size to compute with, and that no tag repeats."""
-    control, (z, tag, valid) = log
-    mask, tags = np.asarray(valid), np.asarray(tag)
-    (steps, places), most = mask.shape, largest(control, z)
-    for field, noun, values, used, advice in (
-        ("control", "a control", control, np.ones(steps, bool), "correct or omit the row"),
-        ("scan.z", "a valid measurement", z, mask, "set log.scan.valid to False there"),
-    ):
-        size = np.abs(np.asarray(values, np.float64)).max(axis=-1, initial=0.0)
-        _refuse(field, used & ~np.isfinite(size), f"{noun} is not finite", advice)
-        _refuse(field, used & (size > most), f"{noun} is beyond ±{most:.2g}", advice)
-    _refuse("scan.tag", mask & (tags < -1), "a tag is below -1")
-    _refuse("scan.tag", mask & (tags > np.iinfo(np.int32).max), "a tag is beyond int32")
-    # Unknown tags become -1, -2, … of each row, so that they repeat nothing.
-    named = np.where(mask & (tags >= 0), tags, -1 - np.arange(places))
-    for part in np.split(named, np.cumsum(parts)[:-1].astype(int), axis=1) if parts else (named,):
-        ordered = np.sort(part, axis=1)
-        repeats = (ordered[:, 1:] == ordered[:, :-1]).any(axis=1)
-        _refuse("scan.tag", repeats, "a tag repeats within the scan")
 
 
 def _refuse(field: str, bad: np.ndarray, fault: str, advice: str = "") -> None:

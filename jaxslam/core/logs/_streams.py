@@ -4,7 +4,7 @@ A row is a time: the control that leads to it from the row before, and the scan 
 rows of two streams with times of their own; the rules say what control a stream of odometry gives.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -71,6 +71,23 @@ def align_streams(
     padded_tag[row, slot] = tag[order]
     valid[row, slot] = True
     return Rows(time, rule(clock, moved, time), padded_z, padded_tag, valid)
+
+
+def join_slots(scans: Sequence[Rows], places: Sequence[int | None]) -> Rows:
+    """Rows at the same times with the slots of several sensors side by side.
+
+    Each is padded to its places (None: to none more), and z to the longest of all.
+    """
+    size = max(rows.z.shape[2] for rows in scans)
+    blocks = []
+    for rows, count in zip(scans, places, strict=True):
+        spare = 0 if count is None else count - rows.tag.shape[1]
+        slots = (0, 0), (0, spare)
+        z = np.pad(rows.z, (*slots, (0, size - rows.z.shape[2])))
+        tag = np.pad(rows.tag, slots, constant_values=-1)
+        blocks.append((z, tag, np.pad(rows.valid, slots)))
+    z, tag, valid = (np.concatenate(parts, axis=1) for parts in zip(*blocks, strict=True))
+    return Rows(scans[0].time, scans[0].control, z, tag, valid)
 
 
 def as_recorded(

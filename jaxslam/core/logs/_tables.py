@@ -1,13 +1,14 @@
 """Columns of odometry and measurements, from lists, arrays or data frames, as the rows of a log."""
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, Generic, NamedTuple, Protocol, TypeAlias, TypeVar
 
 import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from jaxslam.core._numbers import is_number
 from jaxslam.core._units import TURN, are_headings_in_degrees
 from jaxslam.core.logs import _streams as streams
 from jaxslam.core.validation import InvalidField
@@ -31,6 +32,7 @@ _INCREMENT = ("forward [m]", "left [m]", "turn [rad]")
 
 _Name = TypeVar("_Name", bound=int | str)
 """of a landmark"""
+_Value = TypeVar("_Value")
 
 
 class _ByName(Protocol):
@@ -44,18 +46,29 @@ Tabular: TypeAlias = Sequence[Sequence[object]] | np.ndarray | _ByName
 
 
 class Columns(NamedTuple, Generic[_Name]):
-    """Columns of one length by name, and where a cell is, for messages."""
+    """Columns of one length by name, and what is said of a cell."""
 
     columns: dict[str, Float[np.ndarray, "K"]]
     """float64, by name with unit, as "v [m/s]" """
     tags: list[_Name | None] | None
     """the column `TAG`: names, None where unknown; None without such a column"""
-    at: Callable[[int, str], str]
-    """(row, column) -> the place of a cell, with which a message begins"""
+    error: Callable[[int, str, str], ValueError]
+    """(row, column, reason) -> an error about a cell; as text, also a note: its place and reason"""
 
     def values(self, names: Sequence[str]) -> np.ndarray:
         """Some columns side by side, (K, len(names))."""
+        if not names:  # of a robot without odometry
+            return np.zeros((len(self.columns[TIME]), 0))
         return np.column_stack([self.columns[name] for name in names])
+
+
+_OUTSIDE = "measurements outside the odometry"
+_IN_GAP = "measurements in a gap of the odometry"
+_NEGATIVE = "measurements with a range below 0"
+_BEYOND = "measurements of the maximum range"
+_SOON = "measurements closer than the spacing"
+_DROPPED = (_OUTSIDE, _IN_GAP, _NEGATIVE, _BEYOND, _SOON)
+"""Why measurements are not in the rows; the first is stated with a count of 0, too."""
 
 
 class Seen(NamedTuple, Generic[_Name]):
@@ -71,6 +84,62 @@ class Seen(NamedTuple, Generic[_Name]):
     spacing: float = 0.0
     """[s] the least time between two measurements of a landmark that are kept"""
 
+    def tags_in_scans(self, tag_of: Mapping[_Name, int]) -> Int[np.ndarray, "J"]:
+        """The tag of each measurement, -1 where unknown.
+
+        Raises ValueError, with the place, on times that fall, a tag twice at a time, and more
+        measurements at a time than slots.
+        """
+        table, when = self.table, self.table.columns[TIME]
+        check_times(table, strict=False)
+        named = table.tags or [None] * len(when)
+        tags = [-1 if name is None else tag_of.get(name, -1) for name in named]
+        scan: set[tuple[float, int]] = set()
+        for row, pair in enumerate(zip(when.tolist(), tags, strict=True)):
+            if pair[1] >= 0 and pair in scan:
+                raise table.error(
+                    row,
+                    TAG,
+                    f"expected a tag once at a time, got {named[row]!r} twice at t = "
+                    f"{pair[0]:.12g}",
+                )
+            scan.add(pair)
+        if self.places is not None:
+            # Times rise, so more than `places` are equal where one is that so many lines before.
+            late = np.flatnonzero(when[self.places :] == when[: -self.places])
+            if late.size:
+                raise table.error(
+                    int(late[0]) + self.places,
+                    TIME,
+                    f"expected at most {self.places} measurement{'s' * (self.places > 1)} at a "
+                    "time, the slots of the sensor, got more",
+                )
+        return np.array(tags, np.int64)
+
+    def unused(
+        self, tag: Int[np.ndarray, "J"], inside: Bool[np.ndarray, "J"]
+    ) -> dict[str, Bool[np.ndarray, "J"]]:
+        """Masks of the measurements, among those inside, that say nothing or too much, by reason.
+
+        Raises ValueError, with the place, on one of an unknown landmark where there is a spacing.
+        """
+        values, when = self.table.values(self.measured), self.table.columns[TIME]
+        ranges = [k for k, name in enumerate(self.measured) if split_unit(name)[0] == "range"]
+        negative = inside & (values[:, ranges] < 0).any(axis=1)
+        beyond = inside & (values[:, ranges] >= self.max_range).any(axis=1)
+        rest = inside & ~negative & ~beyond
+        too_soon = np.zeros(len(tag), bool)
+        if self.spacing and (unknown := np.flatnonzero(rest & (tag < 0)).tolist()):
+            reason = "expected a tag, since a spacing is of one landmark, got none"
+            raise self.table.error(unknown[0], TAG, reason)
+        last: dict[int, float] = {}
+        for row in np.flatnonzero(rest) if self.spacing else ():
+            # A spacing of whole intervals is not to be missed by rounding of the stamps.
+            too_soon[row] = when[row] - last.get(tag[row], -math.inf) < self.spacing * (1 - 1e-6)
+            if not too_soon[row]:
+                last[tag[row]] = when[row]
+        return {_NEGATIVE: negative, _BEYOND: beyond, _SOON: too_soon}
+
 
 class Aligned(NamedTuple, Generic[_Name]):
     """The rows of all tables, and what became of their names and measurements."""
@@ -85,6 +154,11 @@ def split_unit(name: str) -> tuple[str, str | None]:
     """Name and unit of a column, ("v", "m/s") of "v [m/s]"; None without a unit."""
     bare, bracket, unit = name.strip().partition("[")
     return bare.strip(), unit.rstrip("] ").strip() if bracket else None
+
+
+def label(name: str) -> str:
+    """The name of a column without its unit, as one word: scale_1 of "scale 1 [1]"."""
+    return split_unit(name)[0].replace(" ", "_")
 
 
 def unit_divisor(unit: str | None, wanted: str) -> float | None:
@@ -133,137 +207,66 @@ def align_tables(
     """
     clock = odometry.columns[TIME]
     check_times(odometry, strict=True)
+
+    # How the odometry becomes controls, and until when it is one.
     columns = odometry_columns(controls, tuple(odometry.columns))
-    last = clock[-1]
+    end = clock[-1]
     rule: streams.Rule = streams.relative_poses if columns == POSE else streams.as_recorded
     if columns != POSE and INTERVAL in controls and controls[:3] != _INCREMENT:
         rule = streams.hold
-        last += np.max(np.diff(clock), initial=0.0)
-    stamps = [seen.table.columns[TIME] for seen in sensors]
-    within = [(t >= clock[0]) & (t <= last) for t in stamps]
-    in_gap = 0
-    if columns == POSE:
-        joined = ~streams.is_gap(clock)
-        covered = [streams.between_lines(clock, t, joined) for t in stamps]
-        in_gap = sum(int((w & ~c).sum()) for w, c in zip(within, covered, strict=True))
-        within = [w & c for w, c in zip(within, covered, strict=True)]
+        end += np.max(np.diff(clock), initial=0.0)
+
+    # The measurements at whose time there is odometry.
+    dropped = dict.fromkeys(_DROPPED, 0)
+    inside = []
+    for seen in sensors:
+        when = seen.table.columns[TIME]
+        within = (when >= clock[0]) & (when <= end)
+        joined = within
+        if columns == POSE:
+            joined = within & streams.between_lines(clock, when, ~streams.is_gap(clock))
+        dropped[_OUTSIDE] += int((~within).sum())
+        dropped[_IN_GAP] += int((within & ~joined).sum())
+        inside.append(joined)
+
+    # Tags of the names of their landmarks.
     named = {
         name
-        for seen, inside in zip(sensors, within, strict=True)
-        for name, kept in zip(seen.table.tags or (), inside, strict=False)
+        for seen, is_inside in zip(sensors, inside, strict=True)
+        for name, kept in zip(seen.table.tags or (), is_inside, strict=False)
         if kept
     }
     tag_of = {name: tag for tag, name in enumerate(sort_names({*names, *named}))}
-    tags = [_tags_in_scans(seen, tag_of) for seen in sensors]
-    # Those in a gap are outside of `within`, too, but have a count of their own.
-    kept, outside, negative, beyond, soon = [], -in_gap, 0, 0, 0
-    for seen, tag, inside in zip(sensors, tags, within, strict=True):
+    tags = [seen.tags_in_scans(tag_of) for seen in sensors]
+
+    # Of these measurements, those that say something.
+    used_streams = []
+    for seen, tag, is_inside in zip(sensors, tags, inside, strict=True):
         when = seen.table.columns[TIME]
-        lost = np.flatnonzero(inside & ~np.isin(when, clock))
+        lost = np.flatnonzero(is_inside & ~np.isin(when, clock))
         if lost.size and rule is streams.as_recorded:
-            raise InvalidField(
-                seen.table.at(int(lost[0]), TIME),
+            raise seen.table.error(
+                int(lost[0]),
+                TIME,
                 f"expected a time of the odometry, since {', '.join(columns)} cannot be divided, "
                 f"got {when[lost[0]]:.12g}; poses can: {TIME}, {', '.join(POSE)}",
             )
-        values = seen.table.values(seen.measured)
-        ranges = [k for k, name in enumerate(seen.measured) if split_unit(name)[0] == "range"]
-        no_echo = inside & (values[:, ranges] < 0).any(axis=1)
-        far = inside & (values[:, ranges] >= seen.max_range).any(axis=1)
-        used = inside & ~no_echo & ~far
-        early = used & _is_too_soon(seen, tag, used)
-        used &= ~early
-        kept.append((when[used], tag[used], values[used]))
-        outside += int((~inside).sum())
-        negative += int(no_echo.sum())
-        beyond += int(far.sum())
-        soon += int(early.sum())
-    times = np.unique(np.concatenate([clock, *(when for when, *_ in kept)]))
+        unused = seen.unused(tag, is_inside)
+        for reason, mask in unused.items():
+            dropped[reason] += int(mask.sum())
+        used = is_inside & ~np.logical_or.reduce(list(unused.values()))
+        used_streams.append((when[used], tag[used], seen.table.values(seen.measured)[used]))
+
+    # A row at every time, with the slots of the sensors side by side.
+    times = np.unique(np.concatenate([clock, *(when for when, *_ in used_streams)]))
     moved = clock, odometry.values(columns)
-    places = [seen.places for seen in sensors]
-    rows = _join_slots(
-        [streams.align_streams(moved, stream, rule, times) for stream in kept], places
-    )
+    scans = [streams.align_streams(moved, stream, rule, times) for stream in used_streams]
+    rows = streams.join_slots(scans, [seen.places for seen in sensors])
     if INTERVAL in controls and rule is not streams.hold:
         interval = np.diff(rows.time, prepend=rows.time[:1])
         rows = rows._replace(control=np.column_stack([rows.control, interval]))
-    dropped = {"measurements outside the odometry": outside}
-    counts = {
-        "measurements in a gap of the odometry": in_gap,
-        "measurements with a range below 0": negative,
-        "measurements of the maximum range": beyond,
-        "measurements closer than the spacing": soon,
-    }
-    dropped |= {reason: count for reason, count in counts.items() if count}
-    return Aligned(rows, tuple(tag_of), dropped)
-
-
-def _tags_in_scans(seen: Seen[_Name], tag_of: dict[_Name, int]) -> Int[np.ndarray, "J"]:
-    """The tag of each measurement of a sensor, -1 where unknown; ValueError as `align_tables`."""
-    table, when = seen.table, seen.table.columns[TIME]
-    check_times(table, strict=False)
-    named = table.tags or [None] * len(when)
-    tags = [-1 if name is None else tag_of.get(name, -1) for name in named]
-    scan: set[tuple[float, int]] = set()
-    for row, pair in enumerate(zip(when.tolist(), tags, strict=True)):
-        if pair[1] >= 0 and pair in scan:
-            raise InvalidField(
-                table.at(row, TAG),
-                f"expected a tag once at a time, got {named[row]!r} twice at t = {pair[0]:.12g}",
-            )
-        scan.add(pair)
-    if (
-        seen.places is not None
-        and (late := np.flatnonzero(when[seen.places :] == when[: -seen.places])).size
-    ):
-        raise InvalidField(
-            table.at(int(late[0]) + seen.places, TIME),
-            f"expected at most {seen.places} measurement{'s' * (seen.places > 1)} at a time, the "
-            "slots of the sensor, got more",
-        )
-    return np.array(tags, np.int64)
-
-
-def _is_too_soon(
-    seen: Seen[_Name], tag: Int[np.ndarray, "J"], used: Bool[np.ndarray, "J"]
-) -> Bool[np.ndarray, "J"]:
-    """Mask of the measurements sooner after one of the same landmark than the spacing."""
-    too_soon = np.zeros(len(tag), bool)
-    if not seen.spacing:
-        return too_soon
-    if unknown := np.flatnonzero(used & (tag < 0)).tolist():
-        reason = "expected a tag, since a spacing is of one landmark, got none"
-        raise InvalidField(seen.table.at(unknown[0], TAG), reason)
-    when = seen.table.columns[TIME]
-    last: dict[int, float] = {}
-    for row in np.flatnonzero(used):
-        # A spacing of whole intervals is not to be missed by rounding of the stamps.
-        too_soon[row] = when[row] - last.get(tag[row], -math.inf) < seen.spacing * (1 - 1e-6)
-        if not too_soon[row]:
-            last[tag[row]] = when[row]
-    return too_soon
-
-
-def _join_slots(scans: Sequence[streams.Rows], places: Sequence[int | None]) -> streams.Rows:
-    """Rows at the same times with the slots of several sensors, each padded to its places, and z to
-    the longest."""
-    size = max(rows.z.shape[2] for rows in scans)
-
-    def pad(rows: streams.Rows, count: int | None) -> streams.Rows:
-        spare = 0 if count is None else count - rows.tag.shape[1]
-        slots = (0, 0), (0, spare)
-        return rows._replace(
-            z=np.pad(rows.z, (*slots, (0, size - rows.z.shape[2]))),
-            tag=np.pad(rows.tag, slots, constant_values=-1),
-            valid=np.pad(rows.valid, slots),
-        )
-
-    blocks = [pad(*pair) for pair in zip(scans, places, strict=True)]
-    z, tag, valid = (
-        np.concatenate([getattr(rows, name) for rows in blocks], axis=1)
-        for name in ("z", "tag", "valid")
-    )
-    return streams.Rows(scans[0].time, scans[0].control, z, tag, valid)
+    counts = {reason: n for reason, n in dropped.items() if n or reason == _OUTSIDE}
+    return Aligned(rows, tuple(tag_of), counts)
 
 
 def check_times(table: Columns[_Name], *, strict: bool) -> None:
@@ -273,8 +276,7 @@ def check_times(table: Columns[_Name], *, strict: bool) -> None:
     if back.size:
         before, at = time[back[0] : back[0] + 2].tolist()
         wanted = f"above {before}" if strict else f"of at least {before}"
-        place = table.at(int(back[0]) + 1, TIME)
-        raise InvalidField(place, f"expected a time {wanted}, got {at}")
+        raise table.error(int(back[0]) + 1, TIME, f"expected a time {wanted}, got {at}")
 
 
 DEGREES_OF_PATH = (
@@ -282,7 +284,7 @@ DEGREES_OF_PATH = (
     "write [deg]"
 )
 
-_LATEST = 1e11
+LATEST = 1e11
 """Stamp [s] that no clock has; milliseconds since 1970 are above 1e12."""
 
 
@@ -298,20 +300,22 @@ def wrong_units(table: Columns[_Name]) -> list[str]:
         beyond = np.abs(values) > TURN
         if unit in ("rad", "rad/s") and name != POSE[2] and beyond.any():
             row, degrees = int(np.argmax(np.abs(values))), unit.replace("rad", "deg")
-            signs.append(
-                f"{table.at(row, name)}: {int(beyond.sum()):,} of {len(values):,} numbers are "
-                f"beyond 2π, up to {values[row]:.6g}: degrees? then write [{degrees}]"
+            text = (
+                f"{int(beyond.sum()):,} of {len(values):,} numbers are beyond 2π, up to "
+                f"{values[row]:.6g}: degrees? then write [{degrees}]"
             )
+            signs.append(table.error(row, name, text))
             break
     if set(POSE) <= set(table.columns) and are_headings_in_degrees(table.values(POSE)):
-        signs.append(f"{table.at(0, POSE[2])}: {DEGREES_OF_PATH}")
-    if (when > _LATEST).any():
+        signs.append(table.error(0, POSE[2], DEGREES_OF_PATH))
+    if (when > LATEST).any():
         row = int(np.argmax(when))
-        signs.append(
-            f"{table.at(row, TIME)}: {when[row]:.6g} s is over three thousand years since 1970: "
-            "milliseconds, microseconds or nanoseconds? then write [ms], [us] or [ns]"
+        text = (
+            f"{when[row]:.6g} s is over three thousand years since 1970: milliseconds, "
+            "microseconds or nanoseconds? then write [ms], [us] or [ns]"
         )
-    return signs
+        signs.append(table.error(row, TIME, text))
+    return list(map(str, signs))
 
 
 def replace_jumps(odometry: Columns[_Name]) -> str:
@@ -326,17 +330,131 @@ def replace_jumps(odometry: Columns[_Name]) -> str:
     length, turn = step_sizes(path)[k]
     for name, column in zip(POSE, without_jumps(path, jumps).T, strict=True):
         odometry.columns[name] = column
-    return (
-        f"{odometry.at(k, POSE[0])}: a jump of the odometry by {length:.3g} m and "
-        f"{np.rad2deg(turn):.3g}° in {clock[k] - clock[k - 1]:.3g} s is no motion, "
-        f"{int(jumps.sum()):,} in all: the step before it takes its place"
+    text = (
+        f"a jump of the odometry by {length:.3g} m and {np.rad2deg(turn):.3g}° in "
+        f"{clock[k] - clock[k - 1]:.3g} s is no motion, {int(jumps.sum()):,} in all: the step "
+        "before it takes its place"
     )
+    return str(odometry.error(k, POSE[0], text))
 
 
 def sort_names(names: set[_Name | None]) -> list[_Name]:
     """The names of landmarks, whole numbers before text; None, the unknown one, is left out."""
     named = (name for name in names if name is not None)
     return sorted(named, key=lambda name: (isinstance(name, str), name))
+
+
+class Table:
+    """Cells under names with units, of a file or an argument, and how they become columns.
+
+    A subclass has the cells, reads one, and says where it is.
+    """
+
+    header: Sequence[str]
+    needs_units = False
+    """whether a column without a unit is refused; else it has that of its name"""
+
+    def cells(self, place: int) -> Sequence[Any]:
+        """The cells of the column at a place."""
+        raise NotImplementedError
+
+    def error(self, reason: str, row: int | None = None, place: int | None = None) -> ValueError:
+        """An error about a cell, the column or the header, for the caller to raise."""
+        raise NotImplementedError
+
+    def number(self, cell: Any, optional: bool = False) -> Any:
+        """The number in a cell; NaN if none is needed; ValueError with the reason."""
+        raise NotImplementedError
+
+    def tag(self, cell: Any) -> int | str | None:
+        """The name of a landmark in a cell, None if it is unknown; ValueError with the reason."""
+        raise NotImplementedError
+
+    @property
+    def names(self) -> list[str]:
+        """The names of the columns, without units."""
+        return [split_unit(name)[0] for name in self.header]
+
+    def place(self, name: str, why: str = "") -> int:
+        """The place of a column; ValueError if it is missing or its unit does not fit the name's.
+
+        why: what needs the column, for the message.
+        """
+        bare, target = split_unit(name)
+        if bare not in self.names:
+            got = ", ".join(map(repr, self.header))
+            raise self.error(f"expected a column {name!r}{f' ({why})' * bool(why)}, got {got}")
+        place = self.names.index(bare)
+        unit = split_unit(self.header[place])[1]
+        is_unknown = self.needs_units if unit is None else unit_divisor(unit, name) is None
+        if target is not None and is_unknown:
+            units = " or ".join(f"[{unit}]" for unit in (target, *UNITS.get(target, {})))
+            raise self.error(f"expected a unit {units}, got {self.header[place]!r}", place=place)
+        return place
+
+    def columns(
+        self, wanted: Sequence[str], why: str = "", optional: Sequence[str] = ()
+    ) -> Columns[int | str]:
+        """The columns `wanted`, as "v [m/s]", in the units of their names.
+
+        Raises ValueError on a column that is missing or has another unit, a cell that is not a
+        number, and a tag that is no name.
+
+        Args:
+            why: what needs the columns, for messages.
+            optional: columns in which a cell without a value is NaN.
+        """
+        places = {name: self.place(name, why) for name in wanted}
+        numbers = {
+            name: self.numbers(place, name, name in optional)
+            for name, place in places.items()
+            if name != TAG
+        }
+        tags = list(self._read(places[TAG], self.tag)) if TAG in places else None
+        return Columns(numbers, tags, lambda row, name, text: self.error(text, row, places[name]))
+
+    def numbers(self, place: int, name: str = "", optional: bool = False) -> Float[np.ndarray, "K"]:
+        """The column at a place in the unit of a name, as float64; see `columns`."""
+        divisor = unit_divisor(split_unit(self.header[place])[1], name) or 1
+
+        def quotient(cell: Any) -> float:
+            # A whole number by a whole number, rounded once.
+            return float(self.number(cell, optional) / divisor)
+
+        return np.fromiter(self._read(place, quotient), np.float64)
+
+    def _read(self, place: int, read: Callable[[Any], _Value]) -> Iterator[_Value]:
+        """What a function reads in each cell of a column; its errors get the place."""
+        for row, cell in enumerate(self.cells(place)):
+            try:
+                yield read(cell)
+            except ValueError as problem:
+                raise self.error(str(problem), row, place) from None
+
+
+class _Argument(Table):
+    """The columns of an argument, by their place in the header."""
+
+    def __init__(self, argument: str, header: Sequence[str]) -> None:
+        self.argument = argument
+        self.header = header
+        self.by_place: dict[int, Sequence[object]] = {}
+
+    def cells(self, place: int) -> Sequence[object]:
+        return self.by_place[place]
+
+    def error(self, reason: str, row: int | None = None, place: int | None = None) -> InvalidField:
+        where = "" if row is None or place is None else f", row {row}, column {self.names[place]}"
+        return InvalidField(self.argument + where, reason)
+
+    def number(self, cell: object, optional: bool = False) -> int | float:
+        value = _scalar(cell)
+        if is_number(value):
+            return value
+        raise ValueError(f"expected a finite number, got {cell!r}")
+
+    def tag(self, cell: object) -> int | str | None:
+        return _landmark(cell)
 
 
 def columns_of(
@@ -357,47 +475,33 @@ def columns_of(
     table = _to_numpy(table)
     names = _names(table)
     needed = list(wanted(names or ()))
-
-    def at(row: int, column: str) -> str:
-        return f"{argument}, row {row}, column {split_unit(column)[0]}"
-
+    cells = _Argument(argument, needed if names is None else names)
     if names is None:
         without_axes = isinstance(table, np.ndarray) and table.ndim == 0
         if without_axes or not isinstance(table, Sequence | np.ndarray):
-            raise InvalidField(argument, f"expected rows or columns, got {type(table).__name__}")
+            raise cells.error(f"expected rows or columns, got {type(table).__name__}")
         rows = [_to_numpy(row) for row in table]
         for k, row in enumerate(rows):
             size = len(row) if isinstance(row, Sequence) or np.ndim(row) else 1
             if size != len(needed) or isinstance(row, str):
                 reason = f"expected {len(needed)} values ({', '.join(needed)}), got {size}"
                 raise InvalidField(f"{argument}, row {k}", reason)
-        cells = {name: [row[i] for row in rows] for i, name in enumerate(needed)}
-        divisors: dict[str, float] = dict.fromkeys(needed, 1)
+        cells.by_place = {i: [row[i] for row in rows] for i in range(len(needed))}
     else:
         assert not isinstance(table, Sequence)  # which has no names
-        header = {split_unit(name)[0]: name for name in names}
-        cells, divisors = {}, {}
         for name in needed:
-            bare = split_unit(name)[0]
-            if bare not in header:
-                raise InvalidField(argument, f"expected a column {name!r}, got {', '.join(names)}")
-            divisor = unit_divisor(split_unit(header[bare])[1], name)
-            if divisor is None:
-                raise InvalidField(argument, f"expected the column {name!r}, got {header[bare]!r}")
-            column = _to_numpy(table[header[bare]])
+            place = cells.place(name)
+            column = _to_numpy(table[names[place]])
             if not isinstance(column, Iterable):
-                raise InvalidField(argument, f"expected a column {name!r}, got {column!r}")
-            cells[name], divisors[name] = list(column), divisor
-        lengths = {name: len(column) for name, column in cells.items()}
+                raise cells.error(f"expected a column {name!r}, got {column!r}")
+            cells.by_place[place] = list(column)
+        lengths = {names[place]: len(column) for place, column in cells.by_place.items()}
         if len(set(lengths.values())) > 1:
-            raise InvalidField(argument, f"expected columns of one length, got {lengths}")
-    tags = None
-    if TAG in cells:
-        tags = [_landmark(at(k, TAG), value) for k, value in enumerate(cells.pop(TAG))]
-    columns = {n: _numbers(at, n, column, divisors[n]) for n, column in cells.items()}
-    if not columns[TIME].size:
-        raise InvalidField(argument, "expected at least one row, got none")
-    return Columns(columns, tags, at)
+            raise cells.error(f"expected columns of one length, got {lengths}")
+    columns = cells.columns(needed)
+    if not columns.columns[TIME].size:
+        raise cells.error("expected at least one row, got none")
+    return columns
 
 
 def _to_numpy(value: Any) -> Any:
@@ -413,24 +517,6 @@ def _names(table: Tabular) -> tuple[str, ...] | None:
         return None if table.dtype.names is None else tuple(table.dtype.names)
     columns = getattr(table, "columns", None)
     return None if columns is None else tuple(map(str, columns))
-
-
-def _numbers(
-    at: Callable[[int, str], str], name: str, column: Sequence[object], divisor: float
-) -> Float[np.ndarray, "K"]:
-    """The column, divided, as float64 (K,); raises ValueError on anything but finite numbers."""
-    numbers = np.empty(len(column))
-    for row, cell in enumerate(column):
-        value = _scalar(cell)
-        try:
-            good = isinstance(value, int | float) and not isinstance(value, bool)
-            quotient = value / divisor if good else math.nan  # type: ignore[operator]
-        except OverflowError:  # a whole number that no float holds
-            quotient = math.nan
-        if not math.isfinite(quotient):
-            raise InvalidField(at(row, name), f"expected a finite number, got {cell!r}")
-        numbers[row] = quotient
-    return numbers
 
 
 def _scalar(value: object) -> object:
@@ -449,8 +535,11 @@ def _scalar(value: object) -> object:
     return float(item) if isinstance(item, np.floating) else item  # of a long double
 
 
-def _landmark(place: str, value: object) -> int | str | None:
-    """The name of a landmark, an int or a str; None where it is unknown (None, "", -1 or NaN)."""
+def _landmark(value: object) -> int | str | None:
+    """The name of a landmark, an int or a str; None where it is unknown (None, "", -1 or NaN).
+
+    Raises ValueError with the reason.
+    """
     value = _scalar(value)
     try:
         unknown = value is None or bool(value != value) or value in ("", -1)
@@ -463,7 +552,7 @@ def _landmark(place: str, value: object) -> int | str | None:
     if isinstance(value, float) and value.is_integer():
         value = int(value)
     if isinstance(value, bool) or not isinstance(value, int | str):
-        raise InvalidField(place, f"expected a whole number or text, got {value!r}")
+        raise ValueError(f"expected a whole number or text, got {value!r}")
     if isinstance(value, int) and value < 0:
-        raise InvalidField(place, f"expected a number >= 0, or -1 for unknown, got {value}")
+        raise ValueError(f"expected a number >= 0, or -1 for unknown, got {value}")
     return value

@@ -11,8 +11,9 @@ from jaxslam.core._noise import NoiseCov
 from jaxslam.core.logs._streams import as_recorded
 from jaxslam.core.types import Log
 from jaxslam.core.validation import InvalidField, covariance, require
+from jaxslam.datasets._account import Account
 from jaxslam.datasets._dataset import Dataset
-from jaxslam.datasets._lines import TextFile, none_left
+from jaxslam.datasets._lines import TextFile
 from jaxslam.motion import PoseIncrement
 from jaxslam.sensors import RangeBearing, RelativePosition
 
@@ -52,7 +53,7 @@ def bonn(folder: str | Path) -> Dataset:
     tags: list[int] = []
     z: list[list[float]] = []
     in_step: set[int] = set()
-    dropped = {"negative ranges": 0}
+    account = Account({"negative ranges": 0})
     for line, (keyword, *fields) in file:
         if keyword == "ODOMETRY":
             rot1, trans, rot2 = file.numbers(line, fields, ("rot1", "trans", "rot2"))
@@ -69,7 +70,7 @@ def bonn(folder: str | Path) -> Dataset:
                 raise file.error(line, f"landmark {name} is measured twice in a step")
             in_step.add(name)
             if distance < 0:
-                dropped["negative ranges"] += 1
+                account.drop("negative ranges")
                 continue
             rows.append(len(controls) - 1)
             tags.append(tag_of[name])
@@ -77,8 +78,8 @@ def bonn(folder: str | Path) -> Dataset:
         else:
             raise file.error(line, f"unknown keyword {keyword!r}")
     if not z:
-        if dropped["negative ranges"]:
-            raise none_left(f"{file.path}:{len(file.lines)}", dropped)
+        if account.dropped["negative ranges"]:
+            raise account.none_left(file.path, len(file.lines))
         raise file.end_error(f"no {'SENSOR' if controls else 'ODOMETRY'} line in the file")
     time = np.arange(1.0, len(controls) + 1.0)
     return Dataset(
@@ -90,7 +91,7 @@ def bonn(folder: str | Path) -> Dataset:
         tags=names,
         filter_options={"correction": "joint"},
         landmarks=landmarks,
-        dropped=dropped,
+        **account.fields,
         source=_BONN_SOURCE,
     )
 

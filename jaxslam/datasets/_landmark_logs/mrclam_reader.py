@@ -12,6 +12,7 @@ from jaxslam.core._numbers import is_whole
 from jaxslam.core.logs._streams import Rows, hold
 from jaxslam.core.types import Log
 from jaxslam.core.validation import InvalidField, or_none, refusals_of, require
+from jaxslam.datasets._account import Account
 from jaxslam.datasets._dataset import Dataset
 from jaxslam.datasets._landmark_logs.mrclam_robot import (
     DROP_REASONS,
@@ -27,7 +28,7 @@ from jaxslam.datasets._landmark_logs.mrclam_robot import (
     robot_calibration,
     true_fields,
 )
-from jaxslam.datasets._lines import none_left, stored_file
+from jaxslam.datasets._lines import stored_file
 from jaxslam.sensors import Part, Suite
 from jaxslam.sensors._team import Robot, TeamMotion, sensors_of
 
@@ -93,12 +94,13 @@ def mrclam(
         if not is_whole(robot) or robot not in ROBOTS:
             raise InvalidField("robot", f"expected a number from 1 to 5, got {robot!r}")
         require("calibration", calibration, or_none(robot_calibration))
-    subject_of, names, points, corrections = read_landmarks(Path(folder), errata)
-    lines = read_lines(Path(folder), robot, calibration)
+    account = Account(dict.fromkeys(DROP_REASONS, 0))
+    subject_of, names, points = read_landmarks(Path(folder), errata, account)
+    lines = read_lines(Path(folder), robot, calibration, account)
     time = np.unique(np.concatenate([lines.odometry[:, 0], lines.measurements[:, 0]]))
-    row, tag, kept, dropped = associate(lines.measurements, time, subject_of, names)
+    row, tag, kept = associate(lines.measurements, time, subject_of, names, account)
     if not tag:
-        raise none_left(f"{stored_file(Path(folder) / f'Robot{robot}_Measurement.dat')}:1", dropped)
+        raise account.none_left(stored_file(Path(folder) / f"Robot{robot}_Measurement.dat"), 1)
     motion, sensor = models_of(calibration)
     log = log_of(lines.odometry, time, row, tag, lines.measurements[kept, 2:])
     return Dataset(
@@ -111,8 +113,7 @@ def mrclam(
         filter_options={"correction": "sequential"},
         landmarks=points,
         adjustable=None if calibration is None else adjustable_of(calibration, log, time),
-        dropped=dropped,
-        corrections=(*corrections, *lines.corrections),
+        **account.fields,
         source=SOURCE,
         **true_fields([lines], time),
     )
@@ -166,14 +167,15 @@ def mrclam_team(
             calibrations = [calibration] * len(numbers)
         for constants in calibrations:
             require("calibration", constants, or_none(robot_calibration))
-    subject_of, names, points, corrections = read_landmarks(Path(folder), errata)
+    account = Account(dict.fromkeys(DROP_REASONS, 0))
+    subject_of, names, points = read_landmarks(Path(folder), errata, account)
     files = [
-        read_lines(Path(folder), robot, constants)
+        read_lines(Path(folder), robot, constants, account)
         for robot, constants in zip(numbers, calibrations, strict=True)
     ]
     clocks = [table[:, 0] for lines in files for table in (lines.odometry, lines.measurements)]
     time = np.unique(np.concatenate(clocks))
-    team, scans, controls, dropped = [], [], [], dict.fromkeys(DROP_REASONS, 0)
+    team, scans, controls = [], [], []
     # Robots of equal constants share their models.
     models = {constants: models_of(constants) for constants in set(calibrations)}
     sighting_sensors = {constants: sensor for constants, (_, sensor) in models.items()}
@@ -184,8 +186,7 @@ def mrclam_team(
         }
     for robot, lines, constants in zip(numbers, files, calibrations, strict=True):
         motion, sensor = models[constants]
-        row, tag, kept, lost = associate(lines.measurements, time, subject_of, names + numbers)
-        dropped = {reason: dropped[reason] + lost[reason] for reason in dropped}
+        row, tag, kept = associate(lines.measurements, time, subject_of, names + numbers, account)
         if not tag:
             path = Path(folder) / f"Robot{robot}_Measurement.dat"
             raise ValueError(
@@ -221,8 +222,7 @@ def mrclam_team(
         tags=names,
         filter_options={"correction": "sequential"},
         landmarks=points,
-        dropped=dropped,
-        corrections=(*corrections, *(note for lines in files for note in lines.corrections)),
+        **account.fields,
         source=SOURCE,
         robots=tuple(team),
         **true_fields(files, time),

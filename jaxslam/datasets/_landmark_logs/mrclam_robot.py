@@ -17,6 +17,7 @@ from jaxslam.core.logs._streams import hold, known_poses
 from jaxslam.core.protocols import Motion, Sensor
 from jaxslam.core.types import JaxOrNumPy, Log
 from jaxslam.core.validation import InvalidField, instance_of
+from jaxslam.datasets._account import Account
 from jaxslam.datasets._dataset import Adjustable, Parameter
 from jaxslam.datasets._lines import TextFile, stored_file
 from jaxslam.motion import Unicycle, WhiteNoise
@@ -31,9 +32,9 @@ the exchange."""
 
 
 def read_landmarks(
-    folder: Path, errata: bool
-) -> tuple[dict[int, int], tuple[int, ...], Float[np.ndarray, "N 2"], tuple[str, ...]]:
-    """The subject of each barcode, the subjects and positions of the landmarks, and corrections.
+    folder: Path, errata: bool, account: Account
+) -> tuple[dict[int, int], tuple[int, ...], Float[np.ndarray, "N 2"]]:
+    """The subject of each barcode, and the subjects and positions of the landmarks.
 
     errata: exchange the positions of `EXCHANGED`, if they are those of the file.
     """
@@ -64,12 +65,11 @@ def read_landmarks(
     missing = [name for name in names if name not in points]
     if missing:
         raise file.end_error(f"no position of subject {missing[0]} in the file")
-    corrections: tuple[str, ...] = ()
     if errata and all(points.get(subject) == at for subject, at in EXCHANGED.items()):
         first, second = EXCHANGED
         points[first], points[second] = points[second], points[first]
-        corrections = (f"the surveyed positions of subjects {first} and {second} were exchanged",)
-    return subject_of, names, np.array([points[name] for name in names]), corrections
+        account.correct(f"the surveyed positions of subjects {first} and {second} were exchanged")
+    return subject_of, names, np.array([points[name] for name in names])
 
 
 def read_robot(
@@ -96,19 +96,17 @@ def read_truth(folder: Path, robot: int) -> Float[np.ndarray, "K 4"] | None:
 
 def _read_in_time(file: TextFile, names: tuple[str, ...]) -> Float[np.ndarray, "_ _"]:
     """A table whose first column does not decrease; raises ValueError otherwise."""
-    table: list[list[float]] = []
-    for line, fields in file:
-        values = file.numbers(line, fields, names)
-        if table and values[0] < table[-1][0]:
-            raise file.error(line, f"time goes back from {table[-1][0]} to {values[0]}")
-        if names[1] == "barcode":
+    lines, table = file.table(names)
+    if (back := np.flatnonzero(np.diff(table[:, 0]) < 0)).size:
+        before, after = table[back[0] : back[0] + 2, 0]
+        raise file.error(lines[back[0] + 1], f"time goes back from {before} to {after}")
+    if names[1] == "barcode":
+        for line, fields in file:
             file.identity(line, fields[1], "barcode")
-            if values[2] < 0:
-                raise file.error(line, f"the range {values[2]} is negative")
-        table.append(values)
-    if not table:
-        raise file.end_error("no data in the file")
-    return np.array(table)
+        if (negative := np.flatnonzero(table[:, 2] < 0)).size:
+            row = negative[0]
+            raise file.error(lines[row], f"the range {table[row, 2]} is negative")
+    return table
 
 
 class RobotCalibration(NamedTuple):
@@ -313,24 +311,23 @@ class RobotLines(NamedTuple):
     """(t, barcode, range, bearing)"""
     truth: Float[np.ndarray, "G 4"] | None
     """(t, x, y, θ)"""
-    corrections: tuple[str, ...]
-    """descriptions of the changes to the files"""
 
 
-def read_lines(folder: Path, robot: int, calibration: RobotCalibration | None) -> RobotLines:
+def read_lines(
+    folder: Path, robot: int, calibration: RobotCalibration | None, account: Account
+) -> RobotLines:
     """Read the lines of a robot.
 
     With a calibration, odometry is at the times when the robot moves, and ranges are corrected.
     Raises ValueError on a bearing beyond a right angle, behind the image plane of the camera.
     """
     odometry, measurements = read_robot(folder, robot)
-    truth, corrections = read_truth(folder, robot), []
+    truth = read_truth(folder, robot)
     if truth is not None:
         odometry, cut = cut_after(odometry, truth[-1, 0])
-        if cut:
-            corrections.append(
-                f"{cut:,} odometry lines (0, 0) of robot {robot} after its true path were left out"
-            )
+        account.correct(
+            f"{cut:,} odometry lines (0, 0) of robot {robot} after its true path were left out", cut
+        )
     if calibration is not None:
         odometry[:, 0] += calibration.delay
         beyond = np.abs(measurements[:, 3] - calibration.axis) >= np.pi / 2
@@ -338,7 +335,7 @@ def read_lines(folder: Path, robot: int, calibration: RobotCalibration | None) -
             bearing = measurements[beyond, 3][0]
             raise ValueError(f"Calibration: expected bearings below π/2, got {bearing}")
         measurements[:, 2] /= calibration.range_factor(measurements[:, 3])
-    return RobotLines(odometry, measurements, truth, tuple(corrections))
+    return RobotLines(odometry, measurements, truth)
 
 
 def models_of(calibration: RobotCalibration | None) -> tuple[Motion, Sensor]:
@@ -379,23 +376,23 @@ def associate(
     time: Float[np.ndarray, "T"],
     subject_of: dict[int, int],
     names: tuple[int, ...],
-) -> tuple[list[int], list[int], list[int], dict[str, int]]:
-    """Row, tag and index of the measurements kept, and the number of dropped ones by reason.
+    account: Account,
+) -> tuple[list[int], list[int], list[int]]:
+    """Row, tag and index of the measurements kept.
 
     names: the subjects, landmarks first; their tags are their indices in the list.
     """
     tag_of = {name: tag for tag, name in enumerate(names)}
-    dropped = dict.fromkeys(DROP_REASONS, 0)
     kept: dict[tuple[int, int], int] = {}  # (row, tag) -> index of the measurement
     row = np.searchsorted(time, measurements[:, 0])
     for k, barcode in enumerate(measurements[:, 1]):
         subject = subject_of.get(int(barcode))
         if subject is None:
-            dropped["unknown barcodes"] += 1
+            account.drop("unknown barcodes")
         elif subject not in tag_of:
-            dropped["robot sightings"] += 1
+            account.drop("robot sightings")
         elif (int(row[k]), tag_of[subject]) in kept:
-            dropped["repeated in a scan"] += 1
+            account.drop("repeated in a scan")
         else:
             kept[int(row[k]), tag_of[subject]] = k
-    return [r for r, _ in kept], [t for _, t in kept], list(kept.values()), dropped
+    return [r for r, _ in kept], [t for _, t in kept], list(kept.values())

@@ -20,8 +20,9 @@ from jaxtyping import Float
 
 from jaxslam.core.logs._streams import between_lines, divide, is_gap, known_poses
 from jaxslam.core.types import Log
+from jaxslam.datasets._account import Account
 from jaxslam.datasets._dataset import Dataset
-from jaxslam.datasets._lines import none_left, read_bytes
+from jaxslam.datasets._lines import read_bytes
 from jaxslam.motion import PoseIncrement
 from jaxslam.sensors import RangeOnly
 
@@ -180,15 +181,13 @@ def plaza(
     offset, scale = range_bias
     z = (ranges[inside, 3] - offset) / (1 + scale)
     positive = first[z[first] > 0]
-    gaps = {"ranges in a gap of the odometry": int(in_gap.sum())} if in_gap.any() else {}
-    dropped = {
-        "ranges outside the odometry": int(outside.sum()),
-        **gaps,
-        "repeated ranges": int(inside.sum() - len(first)),
-        "ranges shorter than their bias": len(first) - len(positive),
-    }
+    account = Account({"ranges outside the odometry": int(outside.sum())})
+    account.drop("ranges in a gap of the odometry", in_gap.sum())
+    repeated, short = int(inside.sum() - len(first)), len(first) - len(positive)
+    account.dropped.update({"repeated ranges": repeated, "ranges shorter than their bias": short})
+    account.correct(f"ranges: {offset} m and {100 * scale} % subtracted", any(range_bias))
     if not len(positive):
-        raise none_left(path, dropped)
+        raise account.none_left(path)
     true_path, true_at = known_poses(truth[:, 0], truth[:, 1:], times)
     points = {int(name): (x, y) for name, x, y in survey}
     return Dataset(
@@ -206,10 +205,7 @@ def plaza(
         landmarks=np.array([points[name] for name in names]),
         true_path=true_path,
         true_at=None if true_at.all() else true_at,
-        dropped=dropped,
-        corrections=(
-            (f"ranges: {offset} m and {100 * scale} % subtracted",) if any(range_bias) else ()
-        ),
+        **account.fields,
         source=SOURCE,
     )
 

@@ -154,22 +154,19 @@ def odometry_of_file(
     Raises ValueError, with file and line, on malformed lines, and on stamps that do not join.
     """
     file = TextFile(path, comment="#")
-    rows = [file.numbers(line, fields, ("t", "x", "y", "theta")) for line, fields in file]
-    if not rows:
-        raise file.end_error("expected lines t x y theta, got none")
-    table = np.array(rows)
+    _, table = file.table(("t", "x", "y", "theta"))
     stamps, scans = table[:, 0], len(time)
     order = np.argsort(stamps, kind="stable")
-    after = np.clip(np.searchsorted(stamps[order], time), 1, max(len(rows) - 1, 1))
-    pair = order[np.minimum(np.stack([after - 1, after]), len(rows) - 1)]
+    after = np.clip(np.searchsorted(stamps[order], time), 1, max(len(table) - 1, 1))
+    pair = order[np.minimum(np.stack([after - 1, after]), len(table) - 1)]
     row = np.take_along_axis(pair, np.abs(stamps[pair] - time).argmin(axis=0)[None], axis=0)[0]
     joins = np.abs(stamps[row] - time) <= _STAMP_TOLERANCE
-    note = f"raw odometry is from {file.path}: {len(rows):,} lines, "
+    note = f"raw odometry is from {file.path}: {len(table):,} lines, "
     in_time = np.sum(np.diff(stamps) < 0) <= len(stamps) / 2  # else the file runs backwards
     if joins.all():
         used = len(np.unique(row))
         note += f"{used:,} of them joined to the {scans:,} scans by stamp"
-    elif len(rows) == scans and (row[joins] == np.flatnonzero(joins)).all() and in_time:
+    elif len(table) == scans and (row[joins] == np.flatnonzero(joins)).all() and in_time:
         row, time = np.arange(scans), stamps
         note += "joined to as many scans in order, which take their stamps"
     else:

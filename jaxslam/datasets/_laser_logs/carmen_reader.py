@@ -14,6 +14,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from jaxslam.core.validation import InvalidField, finite, or_none, refusals_of, require
+from jaxslam.datasets._account import Account
 from jaxslam.datasets._laser_logs.carmen_odometry import (
     RawOdometry,
     odometry_of_file,
@@ -105,7 +106,7 @@ def carmen(
     logged: list[list[float]] = []
     scans: list[Scan] = []
     scan_poses: list[tuple[float, ...]] = []
-    dropped: Counter[str] = Counter()
+    account = Account()
     for line, fields in lines:
         if is_scan(fields[0]):
             scan = scan_of(file, line, fields, len(logged) - 1)
@@ -113,42 +114,40 @@ def carmen(
             if fields[0] == kind:
                 scans.append(scan)
             else:
-                dropped[f"scans {fields[0]}"] += 1
+                account.drop(f"scans {fields[0]}")
         elif fields[0] == "ODOM":
             file.expect(line, fields[1:], ODOMETRY)
             numbers = file.numbers(line, [*fields[1:8], fields[9]], [*ODOMETRY[:7], ODOMETRY[8]])
             logged.append([*numbers[:3], *numbers[6:]])
         else:
-            dropped["comments" if fields[0].startswith("#") else f"lines {fields[0]}"] += 1
+            account.drop("comments" if fields[0].startswith("#") else f"lines {fields[0]}")
     if not any(len(scan.ranges) for scan in scans):
         raise file.end_error(f"expected scans with beams, got {len(scans)} of 0 beams")
-    corrections: list[str] = []
-    clock = clock_of(scans, corrections)
+    clock = clock_of(scans, account)
     time = np.array([scan.times[clock] for scan in scans])
-    frame = mount_of(file, kind, scans, corrections) if given_mount is None else given_mount
+    frame = mount_of(file, kind, scans, account) if given_mount is None else given_mount
     corrected, robot = robot_poses(kind, scans, frame, given_mount is not None)
     if odometry is not None:
         joined, time, note = odometry_of_file(odometry, time, str(file.path))
-        corrections.append(note)
-        if logged:
-            dropped["lines ODOM"] = len(logged)
+        account.correct(note)
+        account.drop("lines ODOM", len(logged))
     elif logged:
         table, all_scans = np.array(logged), np.array(scan_poses)
         path_logged, stamp = table[:, :3], table[:, 3 + clock]
         setting, note = setting_lines(
             path_logged, stamp, all_scans[:, 0].astype(int), all_scans[:, 1:]
         )
-        corrections += [note] * bool(note)
+        account.correct(note, note)
         rows = np.array([scan.row for scan in scans])
         joined = odometry_of_lines(path_logged, stamp, setting, rows)
     else:
         joined = odometry_of_poses(robot)
-    beams, limit = beams_of(scans, max_range, dropped, corrections)
-    corrections += _irregularities(kind, time, joined, corrected)
-    if file.lines[-1].strip():
-        corrections.append(
-            f"the last line, {len(file.lines)}, has no newline: its last number may be cut off"
-        )
+    beams, limit = beams_of(scans, max_range, account)
+    _note_irregularities(kind, time, joined, corrected, account)
+    account.correct(
+        f"the last line, {len(file.lines)}, has no newline: its last number may be cut off",
+        file.lines[-1].strip(),
+    )
     return LaserLog(
         name=file.path.name.split(".")[0],
         source=str(file.path),
@@ -164,8 +163,7 @@ def carmen(
         odometry_time=joined.time,
         max_range=limit,
         mount=frame,
-        dropped=dict(dropped),
-        corrections=tuple(corrections),
+        **account.fields,
     )
 
 
@@ -188,20 +186,21 @@ def _kind(file: TextFile, counts: Counter[str], laser: str | None) -> str:
     return laser
 
 
-def _irregularities(
+def _note_irregularities(
     kind: str,
     time: Float[np.ndarray, "K"],
     odometry: RawOdometry,
     corrected: Float[np.ndarray, "K 3"],
-) -> list[str]:
-    """Descriptions of the irregularities of a log."""
-    notes = []
-    if len(odometry.poses) and (early := int((odometry.row < 0).sum())):
-        notes.append(f"scans before the first ODOM line, which take its pose: {early}")
+    account: Account,
+) -> None:
+    """Describe the irregularities of a log."""
+    logged = len(odometry.poses)
+    early = int((odometry.row < 0).sum()) if logged else 0
+    account.correct(f"scans before the first ODOM line, which take its pose: {early}", early)
     if not has_poses(kind):
-        notes.append(f"lines {kind} have no poses to compare with")
-    if not len(odometry.poses):
-        notes.append(
+        account.correct(f"lines {kind} have no poses to compare with")
+    if not logged:
+        account.correct(
             "no ODOM lines: raw odometry is the robot's pose of each scan"
             if has_poses(kind)
             else "no ODOM lines and no poses: raw odometry is unknown, and zero"
@@ -209,18 +208,17 @@ def _irregularities(
     elif has_poses(kind) and odometry.setting:
         apart = poses.between(odometry.raw[0], odometry.raw)[:, :2]
         apart = np.hypot(*(apart - poses.between(corrected[0], corrected)[:, :2]).T)
-        notes.append(
+        account.correct(
             f"ODOM lines that set the odometry to the pose of the scan before: {odometry.setting}; "
             "raw odometry is the chain of the increments between them, and differs from the scans' "
             f"poses by up to {apart.max():.2f} m, {apart[-1]:.2f} m at the end"
         )
-    if len(odometry.poses) and (still := int((~odometry.step_known).sum())):
-        notes.append(
-            f"scans without an ODOM line since the previous scan, with a zero step: {still}"
-        )
-    if backward := int((np.diff(time) < 0).sum()):
-        notes.append(f"scans stamped before their predecessor, kept in order: {backward}")
-    return notes
+    still = int((~odometry.step_known).sum()) if logged else 0
+    account.correct(
+        f"scans without an ODOM line since the previous scan, with a zero step: {still}", still
+    )
+    backward = int((np.diff(time) < 0).sum())
+    account.correct(f"scans stamped before their predecessor, kept in order: {backward}", backward)
 
 
 _FIELDS = "t1", "t2", "x", "y", "z", "roll", "pitch", "yaw"
@@ -255,15 +253,10 @@ def relation_file(path: str | Path) -> StampedRelations:
     (z, roll or pitch above 1e-6), and a file without relations.
     """
     file = TextFile(path, comment="#")
-    rows = []
-    for line, fields in file:
-        row = file.numbers(line, fields, _FIELDS)
-        for name, value in zip(_FIELDS[4:7], row[4:7], strict=True):
-            if abs(value) > _FLAT:
-                raise file.error(line, f"expected a pose in the plane, with {name} 0, got {value}")
-        rows.append(row)
-    if not rows:
-        raise file.end_error(f"expected lines {' '.join(_FIELDS)}, got none")
-    table = np.array(rows)
+    lines, table = file.table(_FIELDS)
+    if (off := np.argwhere(np.abs(table[:, 4:7]) > _FLAT)).size:
+        row, column = off[0]
+        reason = f"with {_FIELDS[4 + column]} 0, got {table[row, 4 + column]}"
+        raise file.error(lines[row], f"expected a pose in the plane, {reason}")
     pose = np.stack([table[:, 2], table[:, 3], wrapped(table[:, 7])], axis=1)
     return StampedRelations(table[:, 0], table[:, 1], pose, str(file.path))

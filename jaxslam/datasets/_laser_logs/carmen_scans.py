@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from jaxslam.datasets._account import Account
 from jaxslam.datasets._laser_logs.laser_record import differs_from_zero, pose_text
 from jaxslam.datasets._lines import TextFile
 from jaxslam.math import numpy_poses as poses
@@ -143,7 +144,7 @@ _REAR = np.array([0.0, 0.0, np.pi])
 """Mount of a laser that looks back."""
 
 
-def clock_of(scans: list[Scan], corrections: list[str]) -> int:
+def clock_of(scans: list[Scan], account: Account) -> int:
     """The index in `Scan.times` of the clock to use.
 
     0 for the measurement; 1 for the logger, if all measurements have the same time.
@@ -152,14 +153,14 @@ def clock_of(scans: list[Scan], corrections: list[str]) -> int:
     if len(scans) == 1 or np.ptp(measured) > 0:
         return 0
     if np.ptp(logged) > 0:
-        corrections.append("all scans have the same timestamp: times are the logger's")
+        account.correct("all scans have the same timestamp: times are the logger's")
         return 1
-    corrections.append("all scans have the same time, by the logger as well")
+    account.correct("all scans have the same time, by the logger as well")
     return 0
 
 
 def mount_of(
-    file: TextFile, kind: str, scans: list[Scan], corrections: list[str]
+    file: TextFile, kind: str, scans: list[Scan], account: Account
 ) -> Float[np.ndarray, "3"]:
     """The pose of the laser on the robot, robot⁻¹ ∘ laser.
 
@@ -177,13 +178,13 @@ def mount_of(
     far = differs_from_zero(off)
     if not kind.startswith("ROBOTLASER"):
         if far.any():
-            corrections.append(
+            account.correct(
                 f"the two poses of {kind} do not differ by a constant mount: the first is taken "
                 "for the corrected pose of the robot"
             )
         if far.any() or not differs_from_zero(mounts[:1]).any():
             return default
-        corrections.append(f"the mount is that of the two poses of {kind}: {pose_text(mounts[0])}")
+        account.correct(f"the mount is that of the two poses of {kind}: {pose_text(mounts[0])}")
     elif far.any():
         k = int(far.argmax())
         raise file.error(

@@ -1,6 +1,5 @@
 """The beams of a laser log from the ranges and angles of its scans."""
 
-from collections import Counter
 from collections.abc import Sequence
 from typing import Protocol
 
@@ -8,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxslam.core.types import Beams
+from jaxslam.datasets._account import Account
 
 
 class RangeScan(Protocol):
@@ -30,9 +30,7 @@ class RangeScan(Protocol):
         """Whether the file has a maximum range that is not finite and above 0."""
 
 
-def beams_of(
-    scans: Sequence[RangeScan], max_range: float, dropped: Counter[str], corrections: list[str]
-) -> tuple[Beams, float]:
+def beams_of(scans: Sequence[RangeScan], max_range: float, account: Account) -> tuple[Beams, float]:
     """The beams (K, B), and the range of beams without a return [m]."""
     width = max(len(scan.ranges) for scan in scans)
     ranges, angles = np.zeros((2, len(scans), width))
@@ -41,25 +39,24 @@ def beams_of(
         count = len(scan.ranges)
         ranges[k, :count], angles[k, :count], present[k, :count] = scan.ranges, scan.angles, True
     valid = present & (ranges > 0)
-    if lost := int((present & ~valid).sum()):
-        dropped["beams without a range"] = lost
+    account.drop("beams without a range", (present & ~valid).sum())
     limits = np.minimum([scan.limit for scan in scans], max_range)
     if (code := _code_of_no_return(ranges[valid & (ranges < limits[:, None])])) is not None:
-        corrections.append(
+        account.correct(
             f"ranges of {code:.2f} m or more are read as no return: the log has many of one value, "
             "and hardly any just below it"
         )
         limits = np.minimum(limits, code)
-    if unstated := sum(scan.bad_limit for scan in scans):
-        corrections.append(
-            f"scans without a maximum range above 0, which take max_range: {unstated}"
-        )
+    unstated = sum(scan.bad_limit for scan in scans)
+    account.correct(
+        f"scans without a maximum range above 0, which take max_range: {unstated}", unstated
+    )
     limit = float(limits.max())
-    if (limits < limit).any():
-        corrections.append(
-            f"maximum ranges differ, the smallest is {limits.min():g} m: a beam beyond that of its "
-            f"scan has no return and is set to {limit:g} m"
-        )
+    account.correct(
+        f"maximum ranges differ, the smallest is {limits.min():g} m: a beam beyond that of its "
+        f"scan has no return and is set to {limit:g} m",
+        (limits < limit).any(),
+    )
     ranges = np.where(ranges >= limits[:, None], limit, ranges)
     return Beams(np.where(valid, ranges, 0.0), angles, valid), limit
 

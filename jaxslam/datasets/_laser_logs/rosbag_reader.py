@@ -1,7 +1,6 @@
 """Laser logs from ROS bags: scans, odometry at each, and the mount of the laser."""
 
 from bisect import bisect_right
-from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
@@ -11,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from jaxslam.core.validation import InvalidField, finite, or_none, refusals_of, require
+from jaxslam.datasets._account import Account
 from jaxslam.datasets._laser_logs.bag_messages import TRANSFORMS, Bag, Topic, open_bag
 from jaxslam.datasets._laser_logs.bag_transforms import (
     UPSIDE_DOWN,
@@ -116,11 +116,10 @@ def rosbag(
         if not max_range > 0:
             raise InvalidField("max_range", f"expected a number above 0, got {max_range}")
         given_mount = require("mount", mount, or_none(finite(3)))
-    corrections: list[str] = []
-    source: list[str] = []  # notes on the source of odometry, after the notes on the scans
-    dropped: Counter[str] = Counter()
+    account = Account()
+    source = Account()  # of the source of odometry, after the notes on the scans
     with open_bag(path) as bag:
-        corrections += bag.notes
+        account.corrections += bag.notes
         laser = _pick_topic(bag, "scan", (LASER_SCAN, MULTI_ECHO), scan)
         if laser is None:
             raise bag.error(
@@ -129,7 +128,7 @@ def rosbag(
         wheels = None
         if odometry is None or ":" not in odometry:  # not two frames, as `odom:base_link`
             wheels = _pick_topic(bag, "odometry", (ODOMETRY,), odometry)
-        messages = _read(bag, laser, wheels, corrections)
+        messages = _read(bag, laser, wheels, account)
         transforms = messages.transforms
         frame, *others = sorted({scan.frame for scan in messages.scans})
         if others:
@@ -139,15 +138,15 @@ def rosbag(
             transforms = transforms + read_transforms(bag, static=False)
         if wheels is None:
             messages = _odometry_of_transforms(bag, messages, transforms, frame, odometry, source)
-        placed, upside_down = _mount(bag, transforms, frame, messages, given_mount, corrections)
+        placed, upside_down = _mount(bag, transforms, frame, messages, given_mount, account)
         for topic in bag.topics:
-            if topic.name not in (laser, wheels) and topic.type not in TRANSFORMS and topic.count:
-                dropped[f"messages {topic.name}"] = topic.count
-        stamp, kept = in_order(bag, laser, "scans", messages.scans, dropped, corrections)
+            if topic.name not in (laser, wheels) and topic.type not in TRANSFORMS:
+                account.drop(f"messages {topic.name}", topic.count)
+        stamp, kept = in_order(bag, laser, "scans", messages.scans, account)
         scans = [_sort_angles(messages.scans[k], upside_down) for k in kept]
-        corrections += source
-        joined = _odometry_at(bag, stamp, messages, wheels, dropped, corrections)
-    beams, limit = beams_of(scans, max_range, dropped, corrections)
+        account.corrections += source.corrections
+        joined = _odometry_at(bag, stamp, messages, wheels, account)
+    beams, limit = beams_of(scans, max_range, account)
     return LaserLog(
         name=Path(path).resolve().name.split(".")[0],
         source=str(path),
@@ -163,8 +162,7 @@ def rosbag(
         odometry_time=seconds(joined.stamp),
         max_range=limit,
         mount=placed,
-        dropped=dict(dropped),
-        corrections=tuple(corrections),
+        **account.fields,
     )
 
 
@@ -321,7 +319,7 @@ def _pick_topic(bag: Bag, argument: str, kinds: tuple[str, ...], name: str | Non
     return topic.name
 
 
-def _read(bag: Bag, laser: str, wheels: str | None, corrections: list[str]) -> _Messages:
+def _read(bag: Bag, laser: str, wheels: str | None, account: Account) -> _Messages:
     """The scans, the odometry of a topic if one is named, and the static transforms."""
     scans: list[_ScanMessage] = []
     odometry: list[_PoseMessage] = []
@@ -337,7 +335,7 @@ def _read(bag: Bag, laser: str, wheels: str | None, corrections: list[str]) -> _
     read = {laser: len(scans), wheels: len(odometry)}
     for topic in bag.topics:
         if topic.name in read and read[topic.name] != topic.count:
-            corrections.append(
+            account.correct(
                 f"{topic.name} has {read[topic.name]:,} messages; the index of the bag says "
                 f"{topic.count:,}"
             )
@@ -404,7 +402,7 @@ def _odometry_of_transforms(
     transforms: Sequence[Transform],
     laser: str,
     pair: str | None,
-    corrections: list[str],
+    account: Account,
 ) -> _Messages:
     """The messages with odometry from two frames of `/tf`: the named pair, or the only pair."""
     option = OPTIONS["odometry"]
@@ -425,7 +423,7 @@ def _odometry_of_transforms(
             f"odometry={first!r} ({option} {first})"
         )
     elif not candidates:
-        corrections.append(
+        account.correct(
             "no odometry is read: raw odometry stands still, and laser odometry takes its place; "
             f"frames of /tf that move: {pairs_text(others)}, of which {option} "
             f"{others[0].name} reads one"
@@ -437,7 +435,7 @@ def _odometry_of_transforms(
     else:
         parent, child = candidates[0].parent, candidates[0].child
         if not is_named_odometry(candidates[0]):
-            corrections.append(
+            account.correct(
                 f"odometry is the transform from {parent} to {child}, the only frames of /tf that "
                 "move in the plane"
             )
@@ -455,7 +453,7 @@ def _mount(
     frame: str,
     messages: _Messages,
     given_mount: Float[np.ndarray, "3"] | None,
-    corrections: list[str],
+    account: Account,
 ) -> tuple[Float[np.ndarray, "3"], bool]:
     """The pose of the laser on the robot, and whether the laser is upside down."""
     notes: list[str] = []
@@ -470,10 +468,10 @@ def _mount(
         if given_mount is None:
             raise bag.error(str(problem)) from problem
     if given_mount is None:
-        corrections += notes
+        account.corrections += notes
         return np.zeros(3) if placed is None else placed.pose, bool(placed and placed.upside_down)
     if placed is not None and placed.upside_down:
-        corrections.append(UPSIDE_DOWN)
+        account.correct(UPSIDE_DOWN)
     return given_mount, bool(placed and placed.upside_down)
 
 
@@ -482,8 +480,7 @@ def in_order(
     topic: str,
     kind: str,
     messages: Sequence[Stamped],
-    dropped: Counter[str],
-    corrections: list[str],
+    account: Account,
 ) -> tuple[Int[np.ndarray, "K"], Int[np.ndarray, "K"]]:
     """The increasing stamps [ns] of the messages that are kept, and their indices.
 
@@ -494,15 +491,16 @@ def in_order(
     stamp = np.array([message.stamp for message in messages], np.int64)
     recorded = np.array([message.recorded for message in messages], np.int64)
     if not stamp.any():
-        corrections.append(f"all stamps of {topic} are 0: times are those of the recording")
+        account.correct(f"all stamps of {topic} are 0: times are those of the recording")
         stamp = recorded
     late = np.abs(stamp - recorded)
-    if far := int((late > APART).sum()):
-        corrections.append(
-            f"stamps of {topic} differ from the times of the recording by more than "
-            f"{APART * 1e-9:g} s in {far:,} of {len(stamp):,} messages, by up to "
-            f"{late.max() * 1e-9:.6g} s"
-        )
+    far = int((late > APART).sum())
+    account.correct(
+        f"stamps of {topic} differ from the times of the recording by more than "
+        f"{APART * 1e-9:g} s in {far:,} of {len(stamp):,} messages, by up to "
+        f"{late.max() * 1e-9:.6g} s",
+        far,
+    )
     kept = _longest_in_order(stamp)
     if back := len(stamp) - len(kept):
         if back > BACKWARD * len(stamp):
@@ -512,10 +510,9 @@ def in_order(
                 f"{(stamp[at - 1] - stamp[at]) * 1e-9:.6g} s at message {at}; expected at most "
                 f"{BACKWARD:.0%}"
             )
-        dropped[f"{kind} whose stamp goes back"] = back
+        account.drop(f"{kind} whose stamp goes back", back)
     new = np.diff(stamp[kept], prepend=stamp[kept[0]] - 1) > 0
-    if repeated := int((~new).sum()):
-        dropped[f"{kind} with the stamp of the one before"] = repeated
+    account.drop(f"{kind} with the stamp of the one before", (~new).sum())
     kept = kept[new]
     return stamp[kept], kept
 
@@ -543,8 +540,7 @@ def _odometry_at(
     time: Int[np.ndarray, "K"],
     messages: _Messages,
     wheels: str | None,
-    dropped: Counter[str],
-    corrections: list[str],
+    account: Account,
 ) -> _Odometry:
     """The odometry at each scan, interpolated; without messages zero, with unknown steps.
 
@@ -559,10 +555,9 @@ def _odometry_at(
     good = np.isfinite(path).all(axis=1)
     if not good.any():
         raise bag.error(f"{topic}: none of {len(path):,} messages has a pose in the plane")
-    if lost := int((~good).sum()):
-        dropped["odometry without a pose"] = lost
+    account.drop("odometry without a pose", (~good).sum())
     usable = [message for message, fine in zip(messages.odometry, good, strict=True) if fine]
-    stamp, kept = in_order(bag, topic, "odometry", usable, dropped, corrections)
+    stamp, kept = in_order(bag, topic, "odometry", usable, account)
     path = path[good][kept]
     row = np.searchsorted(stamp, time, side="right") - 1
     within = (row >= 0) & (time <= stamp[-1])
@@ -572,11 +567,12 @@ def _odometry_at(
             f"expected scans within the time of {topic}, from {c:.3f} s to {d:.3f} s, got scans "
             f"from {a:.3f} s to {b:.3f} s"
         )
-    if outside := int((~within).sum()):
-        corrections.append(
-            f"scans before the first or after the last message of {topic}, which take its pose: "
-            f"{outside:,}"
-        )
+    outside = int((~within).sum())
+    account.correct(
+        f"scans before the first or after the last message of {topic}, which take its pose: "
+        f"{outside:,}",
+        outside,
+    )
     lower = np.maximum(row, 0)
     upper = np.minimum(lower + 1, len(stamp) - 1)
     between = np.maximum(stamp[upper] - stamp[lower], 1)
@@ -585,21 +581,18 @@ def _odometry_at(
     interval = np.diff(stamp, prepend=stamp[:1])
     median = np.median(interval[1:]) if len(stamp) > 1 else 0.0
     gap = (between > GAP) & (between > LONG * median) & inside
-    if gap.any():
-        corrections.append(
-            f"scans between two messages of {topic} that are more than {GAP * 1e-9:g} s and "
-            f"{LONG:g} median intervals apart, with unknown steps: {int(gap.sum()):,}"
-        )
-    if slow := int(((between > GAP) & inside & ~gap).sum()):
-        corrections.append(
-            f"scans between two messages of {topic} that are more than {GAP * 1e-9:g} s apart, "
-            f"with a constant velocity in between: {slow:,}"
-        )
+    apart = f"scans between two messages of {topic} that are more than {GAP * 1e-9:g} s"
+    account.correct(
+        f"{apart} and {LONG:g} median intervals apart, with unknown steps: {int(gap.sum()):,}",
+        gap.any(),
+    )
+    slow = int(((between > GAP) & inside & ~gap).sum())
+    account.correct(f"{apart} apart, with a constant velocity in between: {slow:,}", slow)
     jump = odometry_jumps(path, seconds(stamp - stamp[0]))
     if jump.any():
         at = int(np.argmax(jump))
         far, turn = step_sizes(path)[at]
-        corrections.append(
+        account.correct(
             f"jumps of {topic}, which are no motion, so that the steps over them are unknown: "
             f"{int(jump.sum()):,}, first by {far:.3g} m and {np.rad2deg(turn):.3g}° in "
             f"{interval[at] * 1e-9:.3g} s at {seconds(stamp[at : at + 1])[0]:.3f} s"

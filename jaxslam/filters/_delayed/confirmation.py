@@ -2,13 +2,14 @@
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxslam.core.slots import Joint
 from jaxslam.filters._delayed.delayed_filter import DelayedFilter
-from jaxslam.filters._delayed.hypotheses import point_residuals
+from jaxslam.filters._delayed.hypotheses import noise_of, point_residuals
 from jaxslam.filters._delayed.state import (
     SIZE,
     DelayedState,
@@ -46,6 +47,8 @@ def confirm_hypotheses(
     alive, tag = joint.alive[layout.of_hypotheses], joint.tag[layout.of_hypotheses]
     compared = alive[:, None] & stored[None, :] & (tag[:, None] == new.tag[None, :])
     residuals = point_residuals(joint, filter.triangulation, layout.hypothesis_slots, slot)
+    change = jax.vmap(noise_of(filter, state, slot).change)(residuals.value)
+    residuals = residuals._replace(variance=residuals.variance + change)
     squared = jnp.where(compared, residuals.squared_distance(), jnp.inf)
     within = squared <= filter.gamma
     best = jnp.argmin(squared, axis=1)
@@ -58,6 +61,7 @@ def confirm_hypotheses(
         residuals.value[c, best],
         residuals.by_point[c, best],
         residuals.by_stored[c, best],
+        change[c, best],
     )
     joint = correct_hypotheses(joint, layout, constraints, confirmed)
 
@@ -89,6 +93,8 @@ class _Constraints(NamedTuple):
     """H P"""
     cov: Float[Array, "m m"]
     """H P Hᵀ"""
+    variance: Float[Array, "m"]
+    """its diagonal with R(ẑ), by which each is weighted"""
 
 
 def constraints_of(
@@ -98,8 +104,12 @@ def constraints_of(
     value: Float[Array, "m"],
     by_point: Float[Array, "m 2"],
     by_stored: Float[Array, "m 3"],
+    change: Float[Array, "m"],
 ) -> _Constraints:
-    """The constraints between m points and m stored measurements, by their slots."""
+    """The constraints between m points and m stored measurements, by their slots.
+
+    change: R(ẑ) - R(z) of each.
+    """
     by_point = jnp.pad(by_point, [(0, 0), (0, SIZE - 2)])
     rows = covariance_rows(joint)
     hp = jnp.einsum("mi,mid->md", by_point, rows[points])
@@ -107,7 +117,8 @@ def constraints_of(
     columns = hp[:, 3:].reshape(len(points), -1, SIZE)
     cov = jnp.einsum("mni,ni->mn", columns[:, points], by_point)
     cov = cov + jnp.einsum("mni,ni->mn", columns[:, stored], by_stored)
-    return materialize(_Constraints(value, hp, linalg.symmetrize(cov)))
+    cov = linalg.symmetrize(cov)
+    return materialize(_Constraints(value, hp, cov, jnp.diagonal(cov) + change))
 
 
 def correct_hypotheses(
@@ -120,7 +131,9 @@ def correct_hypotheses(
     kept (Schmidt 1966, "Application of state-space methods to navigation problems": variables that
     are considered, not estimated). Of any gain, P ← (I - KH) P (I - KH)ᵀ is the error's covariance:
 
-        x ← x - K g,  P ← P - K HP - (K HP)ᵀ + K S Kᵀ
+        x ← x - K g,  P ← P - K HP - (K HP)ᵀ + K S Kᵀ,  S = H P Hᵀ
+
+    also of the gain with R(ẑ), while P has R(z),
 
     and the covariances of robot, landmarks and stored measurements do not change.
     """
@@ -129,7 +142,7 @@ def correct_hypotheses(
     c = jnp.arange(count)
     # Column block c of row c: the covariance of constraint c with hypothesis c, P Hᵀ.
     ph = constraints.hp[:, hypothesis_rows].reshape(count, count, SIZE)[c, c]
-    variance = jnp.diagonal(constraints.cov)
+    variance = constraints.variance
     used = confirmed & (variance > 0)
     gain = jnp.where(used[:, None], ph / jnp.where(used, variance, 1.0)[:, None], 0.0)
     k_hp = (gain[:, :, None] * constraints.hp[:, None, :]).reshape(rows, -1)

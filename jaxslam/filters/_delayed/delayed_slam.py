@@ -8,6 +8,7 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxslam.core import slots
+from jaxslam.core._numbers import gate_quantile
 from jaxslam.core._record import record
 from jaxslam.core.types import Estimate, Info, Scan
 from jaxslam.filters._delayed.confirmation import confirm_hypotheses
@@ -77,15 +78,19 @@ class DelayedSlam(DelayedFilter):
         scan = scan._replace(z=jnp.where(scan.valid[:, None], scan.z, 0.0))
         state = state._replace(clock=state.clock + 1)
         ekf, sensor = self._ekf, self.sensor_of_table
-        # Hypotheses and stored measurements are not landmarks.
+        # Associate with the landmarks of the map; hypotheses and stored measurements are none.
         is_landmark = jnp.arange(self.layout.slots) < self.capacity
         landmarks = state.joint._replace(alive=state.joint.alive & is_landmark)
         association, matched = associate_scan(
             self.associate, sensor, scan, lambda: prediction_of(ekf, sensor, landmarks)
         )
+        # Correct, as EKF-SLAM does.
         slot = jnp.maximum(association.slot, 0)
-        joint, correction = correct_in_turn(ekf, sensor, state.joint, scan.z, slot, matched)
+        joint, correction = correct_in_turn(
+            ekf, sensor, state.joint, scan.z, slot, matched, gate_quantile(ekf.gate, 1)
+        )
         state = state._replace(joint=joint)
+        # Initialize: store, confirm, intersect, promote.
         is_new, tag = association.is_new, scan.tag
         repeated = slots.seen_before(tag, is_new) if self.by_tag else jnp.zeros_like(is_new)
         identity = tag if self.by_tag else jnp.full_like(tag, -1)
@@ -164,6 +169,7 @@ def _store_measurements(
 
     joint = state.joint
     place, stored = slots.allocate(joint.alive[layout.of_stored], wanted)
+    # R at z, as there is no prediction; with a hypothesis there is one (`StoredNoise`).
     noise_cov = jax.vmap(filter.sensor_of_table.noise_cov)(new.z)
     stored_cov = jnp.einsum("mij,mjk,mlk->mil", by_z, noise_cov, by_z)
     slot = layout.first_stored + place
@@ -172,7 +178,8 @@ def _store_measurements(
     state = state._replace(
         joint=joint,
         taken_at=state.taken_at.at[at].set(state.clock, mode="drop"),
-        noise_var=state.noise_var.at[at].set(stored_cov[:, 2, 2], mode="drop"),
+        z=state.z.at[at].set(new.z, mode="drop"),
+        by_z=state.by_z.at[at].set(by_z[:, 2, 0], mode="drop"),
         counts=state.counts._replace(evicted=add_to(state.counts.evicted, evicted)),
     )
     return state, slot, stored

@@ -7,9 +7,10 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
+from jaxslam.core.protocols import Sensor
 from jaxslam.core.slots import Joint
-from jaxslam.filters._delayed.delayed_filter import Distance
-from jaxslam.filters._delayed.state import SIZE, TableLayout, covariance_blocks
+from jaxslam.filters._delayed.delayed_filter import DelayedFilter, Distance
+from jaxslam.filters._delayed.state import SIZE, DelayedState, TableLayout, covariance_blocks
 from jaxslam.filters._delayed.triangulation import Triangulation
 from jaxslam.math import uncertain_poses
 from jaxslam.math._arrays import Number
@@ -62,6 +63,36 @@ def point_residuals(
     variance = variance + jnp.einsum("pqi,qij,pqj->pq", by_stored, p_ss, by_stored)
     variance = variance + 2 * jnp.einsum("pqi,piqj,pqj->pq", by_point, p_xs, by_stored)
     return materialize(_PointResiduals(value, variance, by_point, by_stored))
+
+
+class StoredNoise(NamedTuple):
+    """The noise of q stored measurements, which P has with R(z), at their predictions.
+
+    R(z) would trust a range that came out short too much (`predicted_noise`). A residual g of a
+    point predicts ẑ = z ⊖ g/(∂q/∂z). The noise of a stored measurement is independent of robot,
+    landmarks and other stored ones, so R(ẑ) in place of R(z) changes its own variance alone.
+    """
+
+    sensor: Sensor
+    z: Float[Array, "q 1"]
+    by_z: Float[Array, "q"]
+    """∂q/∂z"""
+
+    def variance(self, residual: Float[Array, "q"]) -> Float[Array, "q"]:
+        """R(ẑ) in the units of q [rad² or m²], by the residuals of a point."""
+        z_hat = jax.vmap(self.sensor.residual)(self.z, (residual / self.by_z)[:, None])
+        cov: Array = jax.vmap(self.sensor.noise_cov)(z_hat)
+        return self.by_z**2 * cov[:, 0, 0]
+
+    def change(self, residual: Float[Array, "q"]) -> Float[Array, "q"]:
+        """R(ẑ) - R(z)."""
+        return self.variance(residual) - self.variance(jnp.zeros_like(residual))
+
+
+def noise_of(filter: DelayedFilter, state: DelayedState, stored: Int[Array, "q"]) -> StoredNoise:
+    """The noise of stored measurements, by their slots."""
+    place = stored - filter.layout.first_stored
+    return StoredNoise(filter.sensor_of_table, state.z[place], state.by_z[place])
 
 
 class UncertainPoints(NamedTuple):

@@ -8,7 +8,12 @@ from jax import Array
 from jaxtyping import Bool, Float, Int, PyTree
 
 from jaxslam.core.slots import Joint
-from jaxslam.filters._delayed.hypotheses import UncertainPoints, relative_spread, safe_root
+from jaxslam.filters._delayed.hypotheses import (
+    StoredNoise,
+    UncertainPoints,
+    relative_spread,
+    safe_root,
+)
 from jaxslam.filters._delayed.state import SIZE, covariance_blocks, covariance_rows
 from jaxslam.filters._delayed.triangulation import Triangulation
 from jaxslam.math import _linalg as linalg
@@ -44,6 +49,7 @@ class InitialEstimate(NamedTuple):
 def initial_estimate(
     joint: Joint,
     triangulation: Triangulation,
+    noise: StoredNoise,
     start: Float[Array, "2"],
     stored: Int[Array, "m"],
     use: Bool[Array, "m"],
@@ -51,8 +57,9 @@ def initial_estimate(
     """The least-squares estimate of a landmark from m stored measurements, and its residual.
 
     Each stored measurement of the landmark is a constraint g(s_k, x) = 0, to first order
-    e + G_s δs + G_x δx = 0. With M = G_s P_ss G_sᵀ = L Lᵀ, x* is where eᵀ M⁻¹ e is least. The
-    orthogonal Qᵀ (two Householder reflections) that makes L⁻¹ G_x upper triangular divides the rows
+    e + G_s δs + G_x δx = 0. With M = G_s P_ss G_sᵀ = L Lᵀ, x* is where eᵀ M⁻¹ e is least; where R
+    varies, with R(ẑ) of each iterate in M, held (as `graphs.FromSensor` does). The orthogonal Qᵀ
+    (two Householder reflections) that makes L⁻¹ G_x upper triangular divides the rows
     Qᵀ L⁻¹ (e + G_s δs + G_x δx) = 0 into two parts of unit covariance, uncorrelated:
 
     - the first two, R δx = -(e₁ + G₁ δs), give the landmark: P_x· = -R⁻¹ G₁ P_s·, P_xx = (RᵀR)⁻¹;
@@ -65,6 +72,7 @@ def initial_estimate(
     inconsistent Jacobians would give the robot spurious information.
 
     Args:
+        noise: of the stored measurements.
         start: initial value of Gauss-Newton.
         stored: slots of the measurements, those to use first.
         use: mask of the measurements to use.
@@ -85,6 +93,8 @@ def initial_estimate(
         by_stored, by_point = jax.vmap(jax.jacfwd(residual, argnums=(0, 1)), (0, None))(s, point)
         by_stored = jnp.where(use[:, None], by_stored, 0.0)
         cov = jnp.einsum("mi,minj,nj->mn", by_stored, blocks, by_stored)
+        # ∂g/∂q = 1.
+        cov = cov + jnp.diag(noise.change(value))
         inverse_root, positive = linalg.whitener_by_rows(jnp.where(both, cov, unit))
         by_point = inverse_root @ jnp.where(use[:, None], by_point, 0.0)
         return inverse_root @ value, by_stored, by_point, inverse_root, positive

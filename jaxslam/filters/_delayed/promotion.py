@@ -19,6 +19,7 @@ from jaxtyping import Bool, Int, PyTree
 from jaxslam.filters._delayed.delayed_filter import DelayedFilter
 from jaxslam.filters._delayed.hypotheses import (
     closer_than,
+    noise_of,
     point_residuals,
     relative_spread,
     relative_to_robot,
@@ -141,7 +142,8 @@ def _promote(
     residuals = point_residuals(joint, filter.triangulation, hypothesis[None], layout.stored_slots)
     # After the correction by its measurements g has almost no variance: that of the noise is
     # added, for rounding and curvature.
-    variance = residuals.variance[0] + state.noise_var
+    noise = noise_of(filter, state, layout.stored_slots)
+    variance = residuals.variance[0] + noise.variance(residuals.value[0])
     stored = same_tag & (residuals.value[0] ** 2 <= filter.gamma * variance)
     # Of these the oldest and the newest, which were taken from the positions farthest apart: ranks
     # from the oldest, 1 … n; the larger one of the ranks from both ends is outermost.
@@ -195,8 +197,9 @@ def _locate(
     reach = ((s[:, :2] - s[:1, :2]) ** 2).sum(axis=1)
     farthest = s[jnp.argmax(jnp.where(use, reach, -1.0))]
     mirrored = triangulation.mirror_solutions(s[0], farthest, start)
-    estimates = jax.vmap(initial_estimate, (None, None, 0, None, None))(
-        joint, triangulation, jnp.concatenate([start[None], mirrored]), used, use
+    noise = noise_of(filter, state, used)
+    estimates = jax.vmap(initial_estimate, (None, None, None, 0, None, None))(
+        joint, triangulation, noise, jnp.concatenate([start[None], mirrored]), used, use
     )
     cost = jnp.where(estimates.regular, estimates.nis, jnp.inf)
     first = jnp.argmin(cost)

@@ -116,8 +116,10 @@ class DelayedState(NamedTuple):
     """number of processed scans"""
     taken_at: Int[Array, "W"]
     """the scan (`clock`) of each stored measurement"""
-    noise_var: Float[Array, "W"]
-    """the variance of each stored q [rad² or m²]"""
+    z: Float[Array, "W 1"]
+    """each stored measurement as the sensor gave it"""
+    by_z: Float[Array, "W"]
+    """∂q/∂z"""
     persistence: Float[Array, "C"]
     """1 at the start of a hypothesis, plus 1 for each confirmation, less the decay"""
     confirmed_at: Int[Array, "C"]
@@ -158,7 +160,8 @@ def empty_state(
         joint=slots.empty(pose, pose_cov, layout.slots, SIZE),
         clock=none,
         taken_at=jnp.zeros(layout.stored, jnp.int32),
-        noise_var=jnp.zeros(layout.stored, pose.dtype),
+        z=jnp.zeros((layout.stored, 1), pose.dtype),
+        by_z=jnp.ones(layout.stored, pose.dtype),
         persistence=jnp.zeros(layout.hypotheses, pose.dtype),
         confirmed_at=ints,
         group=ints,

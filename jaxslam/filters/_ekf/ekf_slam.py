@@ -1,14 +1,14 @@
 """EKF-SLAM in the order of Solà's guide; the published variants are fields of one filter.
 
-A step predicts, `propagate` (14)-(17), and updates by each sensor of the robot, `update_by_sensor`:
-associate, correct (`correction`, (26)-(30)), initialize (31)-(38), report. Beside this file, the
-plain filter needs `correction` and `whitening`; `linear_system` is for charts and the observability
-monitor, `map_coordinates` for charts and inverse depths, `predicted_measurements` for associations
-that compare a measurement with every landmark.
+A step predicts, `propagate` (14)-(17), and updates by each sensor of the robot in turn,
+`update_by_sensors`: associate, correct (`correction`, (26)-(30)), initialize (31)-(38), report.
+Beside this file, the plain filter needs `correction` and `whitening`; `linear_system` is for charts
+and the observability monitor, `map_coordinates` for charts and inverse depths,
+`predicted_measurements` for associations that compare a measurement with every landmark.
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import get_args
 
@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxslam.association._rules import Known
 from jaxslam.charts import Euclidean, with_further
 from jaxslam.core import slots
+from jaxslam.core._numbers import gate_quantile
 from jaxslam.core._record import field, function_of, record, static
 from jaxslam.core._validation import motion_model, sensor_model
 from jaxslam.core.protocols import (
@@ -147,7 +148,10 @@ class EkfSlam(Filter):
         plain = type(self).predict is EkfSlam.predict and type(self).update is EkfSlam.update
         if not plain:
             return None
-        return LinearizedSteps(lambda s, u, _: propagate(self, s, u), partial(_update, self))
+        return LinearizedSteps(
+            lambda state, u, _: propagate(self, state, u),
+            lambda state, scan, _: update_by_sensors(self, state, scan),
+        )
 
     def init(self, pose: Float[Array, "R"], pose_cov: Float[Array, "R R"]) -> Joint:
         chart, size_l = self.robot_chart, len(self.sensor.landmark)
@@ -170,7 +174,7 @@ class EkfSlam(Filter):
         return propagate(self, state, u)[0]
 
     def update(self, state: Joint, scan: Scan, key: Array) -> tuple[Joint, Info]:
-        return _update(self, state, scan, key)[:2]
+        return update_by_sensors(self, state, scan)[:2]
 
     def estimate(self, state: Joint) -> Estimate:
         return map_coordinates.estimate_of(
@@ -219,22 +223,60 @@ def propagate(filter: EkfSlam, joint: Joint, u: Float[Array, "U"]) -> tuple[Join
     return joint.with_robot(pose)._replace(cov=cov, lin=memory), (transition,)
 
 
-def _update(
-    filter: EkfSlam, joint: Joint, scan: Scan, key: Array
+def update_by_sensors(
+    filter: EkfSlam,
+    joint: Joint,
+    scan: Scan,
+    parts: Sequence[tuple[Sensor | None, Scan, int | None]] | None = None,
+    reserved: Bool[Array, "N"] | None = None,
 ) -> tuple[Joint, Info, LinearSystem]:
-    """`EkfSlam.update` with its linear system: by each sensor, then the life of landmarks."""
+    """The update by each sensor in turn: associate, correct, initialize, report.
+
+    Then landmarks are removed by `EkfSlam.life`. Returns also the linear system, for the monitor.
+
+    parts: the sensors, each with its scan and the births allowed to it; default those of
+    `EkfSlam.sensor`. reserved: slots that no new landmark may take, as the poses of `TeamSlam`.
+    """
+    if parts is None:
+        parts = [(sensor, part, filter.births) for sensor, part in filter.sensor.scans(scan)]
     infos, evicted = [], jnp.zeros_like(joint.alive)
     system: LinearSystem = ()
-    for sensor, sensor_scan in filter.sensor.scans(scan):
+    for sensor, part, births in parts:
         if sensor is None:  # of a suite: it measures other robots, as `TeamSlam` uses
-            infos.append(info_of_ignored(sensor_scan))
+            infos.append(info_of_ignored(part))
             continue
         sensor = of_robot(sensor, filter.motion.state)
-        joint, info, removed, sensor_system = update_by_sensor(
-            filter, sensor, joint, sensor_scan, filter.births
+        # Padding may hold any number, and is multiplied by zero below.
+        part = part._replace(z=jnp.where(part.valid[:, None], part.z, 0.0))
+        # Associate: the landmark of each measurement. The prediction is made only if it is used.
+        association, matched = associate_scan(
+            filter.associate, sensor, part, partial(prediction_of, filter, sensor, joint)
         )
-        infos.append(info)
-        evicted, system = evicted | removed, system + sensor_system
+        # Correct: (26)-(30).
+        # -1, for no slot, becomes index 0; what is read there is masked by `matched`.
+        slot = jnp.maximum(association.slot, 0)
+        # A scan without slots has no S to factor; in turn, it is a loop of no passes.
+        by_scan = filter.correction == "joint" and len(part.tag) > 0
+        gamma = gate_quantile(filter.gate, len(sensor.measurements))
+        correct_by = correct if by_scan else correct_in_turn
+        joint, correction = correct_by(filter, sensor, joint, part.z, slot, matched, gamma)
+        # Measurements outside the gate or with a singular S had no effect in the correction.
+        fused = matched & correction.inside & correction.positive
+        # Initialize: (31)-(38), from the corrected pose, as in the guide.
+        measured = slots.slot_mask(association.slot, fused, len(joint.alive))
+        joint, new, removed, by_pose = initialize(
+            filter, sensor, joint, part, association.is_new, measured, births, reserved
+        )
+        evicted = evicted | removed
+        # Report: a `Status` for every measurement.
+        infos.append(report_scan(part.valid, association, matched, correction, new))
+        # For the monitor; without it, `jit` drops these lines.
+        noise = jax.vmap(partial(predicted_noise, sensor))(correction.z_hat, part.z, fused)
+        system = (
+            *system,
+            LinearMeasurements(correction.jacobian, correction.basis, noise, slot, fused),
+            LinearLandmarks(new.slot, new.granted, by_pose),
+        )
     info = join_infos(infos, scan.z.shape[1])
     if filter.sensor.reduced is not None:
         # An inverse depth that has become certain enough is a point from now on.
@@ -249,48 +291,6 @@ def _update(
         joint = without_landmarks(filter, joint._replace(life=memory), dead)
         info = with_removed(info, evicted | dead)
     return joint, info, system
-
-
-def update_by_sensor(
-    filter: EkfSlam,
-    sensor: Sensor,
-    joint: Joint,
-    scan: Scan,
-    births: int | None,
-    reserved: Bool[Array, "N"] | None = None,
-) -> tuple[Joint, Info, Bool[Array, "N"], LinearSystem]:
-    """The update by the scan of one sensor: associate, correct, initialize, report.
-
-    births: `EkfSlam.births`, or 0 where this sensor starts no landmark (robots, in `TeamSlam`).
-    reserved: slots that no new landmark may take, as the poses of `TeamSlam`. Returns also the
-    slots that were emptied to make room.
-    """
-    # Padding may hold any number, and is multiplied by zero below.
-    scan = scan._replace(z=jnp.where(scan.valid[:, None], scan.z, 0.0))
-    association, matched = associate_scan(
-        filter.associate, sensor, scan, lambda: prediction_of(filter, sensor, joint)
-    )
-    # -1, for no slot, becomes index 0; what is read there is masked by `matched`.
-    slot = jnp.maximum(association.slot, 0)
-    # A scan without slots has no S to factor; in turn, it is a loop of no passes.
-    by_scan = filter.correction == "joint" and len(scan.tag) > 0
-    correct_by = correct if by_scan else correct_in_turn
-    joint, correction = correct_by(filter, sensor, joint, scan.z, slot, matched)
-    # Measurements outside the gate or with a singular S had no effect in the correction.
-    fused = matched & correction.inside & correction.positive
-    measured = slots.slot_mask(association.slot, fused, len(joint.alive))
-    # After the correction, so that a new landmark starts from the corrected pose, as in the guide.
-    joint, new, evicted, by_pose = initialize(
-        filter, sensor, joint, scan, association.is_new, measured, births, reserved
-    )
-    info = report_scan(scan.valid, association, matched, correction, new)
-    # For the monitor; without it, `jit` drops these lines.
-    noise = jax.vmap(partial(predicted_noise, sensor))(correction.z_hat, scan.z, fused)
-    system = (
-        LinearMeasurements(correction.jacobian, correction.basis, noise, slot, fused),
-        LinearLandmarks(new.slot, new.granted, by_pose),
-    )
-    return joint, info, evicted, system
 
 
 def associate_scan(
@@ -325,26 +325,33 @@ def initialize(
 ) -> _Initialized:
     """The map with the new landmarks of a scan, up to `births` and the free slots: Solà (31)-(38).
 
+    L = g(R, z, s̄), P_LL = G_R P_RR G_Rᵀ + G_z R G_zᵀ + G_s S G_sᵀ, P_Lx = G_R P_Rx, with the
+    prior's term of (44); several in one scan are correlated through the robot.
+
     measured: landmarks that the scan corrected, which do not make room for new ones. Returns also
-    the slots (N,) that were emptied to make room, and G_R (M, L, 3) of the new landmarks.
+    the slots (N,) that were emptied to make room, and G_R (M, L, R) of the new landmarks.
     """
-    no_measurement = jnp.zeros_like(is_new)
-    no_landmark = NewLandmarks(
-        jnp.zeros(is_new.shape, jnp.int32), no_measurement, no_measurement, no_measurement
-    )
-    none_evicted = jnp.zeros_like(joint.alive)
-    by_robot = len(is_new), joint.landmarks.shape[1], joint.robot_size
-    no_jacobian = jnp.zeros(by_robot, joint.pose.dtype)
+    chart, m = filter.robot_chart, len(is_new)
+    no_jacobian = jnp.zeros((m, joint.landmarks.shape[1], joint.robot_size), joint.pose.dtype)
+    no, none_evicted = jnp.zeros_like(is_new), jnp.zeros_like(joint.alive)
+    no_landmark = NewLandmarks(jnp.zeros(m, jnp.int32), no, no, no)
     if births == 0:
         return joint, no_landmark._replace(deferred=is_new), none_evicted, no_jacobian
+
+    def invert(
+        point: LinearizationPoint, z: Float[Array, "Z"], tag: Int[Array, ""]
+    ) -> tuple[Float[Array, "L"], Float[Array, "L R"], Float[Array, "L L"]]:
+        # (32); G_R of (33); and what (44) adds to G_R P_RR G_Rᵀ, by the noises of z and s.
+        landmark, by_pose, cov = filter.linearize.invert(sensor, z, tag, point)
+        return landmark, *landmark_errors_in_chart(chart, point.pose, landmark, by_pose, cov)
 
     def start(joint: Joint) -> _Initialized:
         # Each measurement of `is_new` is repeated, deferred, granted, or finds the map full.
         repeated = is_new & slots.seen_before(scan.tag, is_new)
         wanted = is_new & ~repeated
-        rank = jnp.cumsum(wanted)
         # The rank counts from 1, and is constant over the measurements that are not wanted.
-        deferred = no_measurement if births is None else wanted & (rank > births)
+        rank = jnp.cumsum(wanted)
+        deferred = no if births is None else wanted & (rank > births)
         wanted = wanted & ~deferred
         evicted = none_evicted
         if filter.life is not None and filter.life.make_room is not None:
@@ -353,60 +360,32 @@ def initialize(
             evicted = filter.life.make_room(joint, needed, measured)
             joint = without_landmarks(filter, joint, evicted)
         occupied = joint.alive if reserved is None else joint.alive | reserved
-        if births is None or births >= len(wanted):
-            slot, granted = slots.allocate(occupied, wanted)
-            joint, by_pose = augment(filter, sensor, joint, scan.z, scan.tag, slot, granted)
-        else:  # only as many landmarks are computed as may start
-            is_kth = wanted[None, :] & (rank[None, :] == 1 + jnp.arange(births)[:, None])
-            # The measurement (births,) of each birth, where there are so many.
-            source, exists = last_true_column(is_kth)
-            slot, granted = slots.allocate(occupied, exists)
-            z, tag = scan.z[source], scan.tag[source]
-            joint, by_pose = augment(filter, sensor, joint, z, tag, slot, granted)
-            # Back from the births (k) to the measurements (M).
-            k = jnp.clip(rank - 1, 0, births - 1)
-            slot, granted, by_pose = slot[k], wanted & granted[k], by_pose[k]
-        return joint, NewLandmarks(slot, granted, deferred, repeated), evicted, by_pose
+        slot, granted = slots.allocate(occupied, wanted)
+        new = NewLandmarks(slot, granted, deferred, repeated)
+        z, tag, limit = scan.z, scan.tag, m if births is None else births
+        if limit < m:  # only as many landmarks are computed as may start
+            is_kth = granted[None, :] & (rank[None, :] == 1 + jnp.arange(limit)[:, None])
+            # The measurement (limit,) of each birth, where there are so many.
+            source, granted = last_true_column(is_kth)
+            z, tag, slot = z[source], tag[source], slot[source]
+        robot_cov = slots.robot_cov(joint, filter.square_root)
+        point = LinearizationPoint(joint, chart, joint.robot, robot_cov)
+        landmark, by_pose, own_cov = jax.vmap(partial(invert, point))(z, tag)
+        # (35)-(38): P_LL and P_Lx into rows and columns of padding, whose size does not change.
+        joint = slots.scatter(
+            joint, slot, granted, landmark, by_pose, own_cov, tag, square_root=filter.square_root
+        )
+        # max, since a measurement without a slot has index 0, which may be another's slot.
+        entered = jnp.zeros_like(joint.alive).at[slot].max(granted)
+        joint = joint._replace(lin=filter.linearize.remember(joint, entered))
+        if limit < m:  # back from the births to the measurements
+            by_pose = by_pose[jnp.clip(rank - 1, 0, limit - 1)]
+        return joint, new, evicted, by_pose
 
     def start_none(joint: Joint) -> _Initialized:
         return joint, no_landmark, none_evicted, no_jacobian
 
     return where_any(is_new.any(), start, start_none, joint)
-
-
-def augment(
-    filter: EkfSlam,
-    sensor: Sensor,
-    joint: Joint,
-    z: Float[Array, "m Z"],
-    tag: Int[Array, "m"],
-    slot: Int[Array, "m"],
-    granted: Bool[Array, "m"],
-) -> tuple[Joint, Float[Array, "m L R"]]:
-    """The joint with new landmarks of measurements z (m, Z) in free slots (m,), where granted (m,);
-    and their G_R.
-
-    L = g(R, z, s̄), P_LL = G_R P_RR G_Rᵀ + G_z R G_zᵀ + G_s S G_sᵀ, P_Lx = G_R P_Rx: Solà (32)-(38),
-    with the prior's term of (44); several in one scan are correlated through the robot.
-    """
-    chart, square_root = filter.robot_chart, filter.square_root
-    point = LinearizationPoint(joint, chart, joint.robot, slots.robot_cov(joint, square_root))
-
-    def invert(
-        z: Float[Array, "Z"], tag: Int[Array, ""]
-    ) -> tuple[Float[Array, "L"], Float[Array, "L R"], Float[Array, "L L"]]:
-        # (32); G_R of (33); and what (44) adds to G_R P_RR G_Rᵀ, by the noises of z and s.
-        landmark, by_pose, cov = filter.linearize.invert(sensor, z, tag, point)
-        return landmark, *landmark_errors_in_chart(chart, joint.robot, landmark, by_pose, cov)
-
-    landmark, by_pose, landmark_covs = jax.vmap(invert)(z, tag)
-    # (35)-(38): P_LL and P_Lx into rows and columns of padding, whose size does not change.
-    joint = slots.scatter(
-        joint, slot, granted, landmark, by_pose, landmark_covs, tag, square_root=square_root
-    )
-    # max, since a measurement without a slot has index 0, which may be another's slot.
-    new = jnp.zeros_like(joint.alive).at[slot].max(granted)
-    return joint._replace(lin=filter.linearize.born(joint, new)), by_pose
 
 
 def without_landmarks(filter: EkfSlam, joint: Joint, dead: Bool[Array, "N"]) -> Joint:

@@ -84,17 +84,18 @@ class EifSlam(InformationFilter):
         association = associate_by_table(state.tag, state.alive, scan)
         slot, n, names = association.slot, len(state.pose), self.motion.state
         sensor = of_robot(self.sensor, names)
+        # Correct: Ω and ξ by the sum of all measurements, the mean by Ω⁻¹ ξ.
         innovations = tag_innovation.innovations(
             self, state.omega, state.pose, state.landmarks, scan, slot, association.matched
         )
         omega, residual = canonical.measurement_update(state.omega, state.residual, innovations)
-        # The mean is corrected before new landmarks are linearized at it.
         error, solved = canonical.mean_error(omega, residual, innovations.omega_positive)
         innovations = tag_innovation.refuse_unless(solved, innovations)
         turns = tuple(k for k, name in enumerate(names) if name.endswith("[rad]"))
         pose = canonical.correct_pose(state.pose, error[:n], turns)
         landmarks = state.landmarks + error[n:].reshape(state.landmarks.shape)
         landmarks = jnp.where(state.alive[:, None], landmarks, 0.0)
+        # Initialize, linearized at the corrected mean.
         wanted = association.new & association.has_slot & solved
         omega, new_landmarks, initialized = canonical.initialize_landmarks(
             sensor, omega, pose, scan.z, slot, wanted

@@ -7,7 +7,7 @@ from typing import Literal, get_args
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from jaxslam.association._rules import Known, prediction_from
@@ -39,19 +39,18 @@ from jaxslam.filters._ekf.checks import check_iterations
 from jaxslam.filters._ekf.correction import (
     Correction,
     CorrectionOrder,
-    Measurements,
-    in_groups,
     no_correction,
     report_fused,
 )
 from jaxslam.filters._ekf.ekf_slam import associate_scan
-from jaxslam.filters._gaussian_correction import correct_gaussian
+from jaxslam.filters._gaussian_correction import GaussianCorrection, correct_gaussian
 from jaxslam.filters._known_map import hold_map, map_tags
 from jaxslam.filters._reporting import info_of_ignored, join_infos, report_scan
 from jaxslam.linearize._first_order import AtEstimate, predicted_noise
 from jaxslam.math import _linalg as linalg
 from jaxslam.math._arrays import Number
 from jaxslam.math._gaussians import gaussian_terms, is_inside, log_det_of_pivots
+from jaxslam.math._xla import scan_in_groups
 from jaxslam.sensors._suite import of_robot
 
 
@@ -141,30 +140,33 @@ class Localization(Filter):
     def update(self, state: Joint, scan: Scan, key: Array) -> tuple[Joint, Info]:
         infos = []
         for sensor, part in self.sensor.scans(scan):
-            if sensor is None:
+            if sensor is None:  # of a suite: it measures other robots
                 infos.append(info_of_ignored(part))
                 continue
             sensor = of_robot(sensor, self.motion.state)
             # Padding may hold any number, and is multiplied by zero below.
             part = part._replace(z=jnp.where(part.valid[:, None], part.z, 0.0))
+            # Associate; a landmark that is not in the map starts none.
             association, matched = associate_scan(
-                self.associate,
-                sensor,
-                part,
-                lambda: _predict_map(self, sensor, state),  # noqa: B023
+                self.associate, sensor, part, partial(_predict_map, self, sensor, state)
             )
-            # A landmark that is not in the map starts none.
             association = association._replace(is_new=jnp.zeros_like(association.is_new))
-            measurements = part.z, jnp.maximum(association.slot, 0), matched
+            # Correct, at once or one measurement after the other.
             gamma = gate_quantile(self.gate, len(sensor.measurements))
-            correct = partial(_correct, self, sensor, gamma)
+            correct = partial(_correct, self, sensor, gamma=gamma)
+            measurements = part.z, jnp.maximum(association.slot, 0), matched
             if self.correction == "joint" and len(part.tag) > 0:
-                state, correction = correct(state, measurements)
+                state, correction = correct(state, *measurements)
             else:
-                # H is by the pose alone, as of landmarks without parameters.
-                robot = state._replace(landmarks=state.landmarks[:, :0])
-                unmatched = partial(no_correction, robot, chart=Euclidean())
-                state, correction = in_groups(correct, state, measurements, 1, unmatched)
+                skip = partial(
+                    no_correction,
+                    (1, part.z.shape[1]),
+                    state.robot_size,  # H has the columns of the robot alone
+                    jnp.result_type(part.z, state.pose, state.cov),
+                    has_basis=False,
+                )
+                state, correction = scan_in_groups(correct, skip, state, measurements, 1)
+            # Report.
             infos.append(report_scan(part.valid, association, matched, correction))
         return state, join_infos(infos, scan.z.shape[1])
 
@@ -229,57 +231,68 @@ def _linearize(
 def _correct(
     filter: Localization,
     sensor: Sensor,
-    gamma: Number | None,
     state: Joint,
-    measurements: Measurements,
+    z: Float[Array, "m Z"],
+    slot: Int[Array, "m"],
+    matched: Bool[Array, "m"],
+    gamma: Number | None,
 ) -> tuple[Joint, Correction]:
-    """The state corrected by m measurements at once, Solà (26)-(30) with H by the pose alone.
+    """The state corrected by m measurements at once, Solà (26)-(30) with H by the robot alone.
 
-    The gate, R(ẑ) and the reported numbers are those of the first iteration; see
-    `correction.correct`.
+    The first iteration, at the prior, decides the gate, R(ẑ) and the reported numbers; a further
+    one linearizes at the newest estimate, but starts again from the prior (`correction._innovate`).
     """
-    z, slot, matched = measurements
     chart, robot, (m, size_z) = filter.robot_chart, state.robot, z.shape
-    pose, xi = robot, jnp.zeros_like(robot)
-    for i in range(filter.iterations):
-        z_hat, h, added_noise = _linearize(filter, sensor, state, slot, pose)
-        nu, jacobian = jax.vmap(sensor.residual)(z, z_hat), h
+
+    def linearize(pose: Float[Array, "R"], xi: Float[Array, "R"]) -> tuple[Array, ...]:
+        """ẑ, ν, H by the errors, H by the coordinates, and added noise at the pose x ⊞ ξ."""
+        z_hat, by_pose, added_noise = _linearize(filter, sensor, state, slot, pose)
+        h, nu = by_pose, jax.vmap(sensor.residual)(z, z_hat)
         if chart.basis is not None:
-            h = h @ jax.jacfwd(chart.retract_pose, argnums=1)(robot, xi)
-        if i == 0:
-            noise = jax.vmap(partial(predicted_noise, sensor))(z_hat, z, matched) + added_noise
-            s_ii = linalg.symmetrize(h @ state.cov @ h.transpose(0, 2, 1) + noise)
-            alone = jax.vmap(gaussian_terms)(nu, s_ii)
-            prior = Correction(
-                z_hat=z_hat,
-                innovation=nu,
-                innovation_cov=s_ii,
-                nis=alone.distance,
-                log_likelihood=jnp.zeros_like(alone.distance),
-                inside=is_inside(alone.distance, gamma),
-                positive=alone.positive,
-                jacobian=jacobian,
-                basis=None,
-            )
-            fuse = matched & prior.inside & prior.positive
-            # R of the scan, block diagonal: (m, Z, m, Z) as a (K, K) matrix, K = m·Z. A measurement
-            # that is not fused has ν = 0, H = 0 and R = 1, and so no effect on the others.
-            blocks = jnp.where(fuse[:, None, None], noise, jnp.eye(size_z, dtype=noise.dtype))
-            diagonal = jnp.eye(m, dtype=noise.dtype)[:, None, :, None] * blocks[:, :, None]
-            scan_noise = diagonal.reshape(m * size_z, m * size_z)
-        else:
-            nu = nu + h @ xi
-        correction = correct_gaussian(
+            h = by_pose @ jax.jacfwd(chart.retract_pose, argnums=1)(robot, xi)
+        return z_hat, nu, h, by_pose, added_noise
+
+    # (25)-(27) for each measurement alone: its gate.
+    z_hat, nu, h, by_pose, added_noise = linearize(robot, jnp.zeros_like(robot))
+    noise = jax.vmap(partial(predicted_noise, sensor))(z_hat, z, matched) + added_noise
+    s_ii = linalg.symmetrize(h @ state.cov @ h.transpose(0, 2, 1) + noise)
+    alone = jax.vmap(gaussian_terms)(nu, s_ii)
+    prior = Correction(
+        z_hat=z_hat,
+        innovation=nu,
+        innovation_cov=s_ii,
+        nis=alone.distance,
+        log_likelihood=jnp.zeros_like(alone.distance),
+        inside=is_inside(alone.distance, gamma),
+        positive=alone.positive,
+        jacobian=by_pose,
+        basis=None,
+    )
+    fuse = matched & prior.inside & prior.positive
+    # R of the scan, block diagonal: (m, Z, m, Z) as a (mZ, mZ) matrix, mZ = m·Z. A measurement that
+    # is not fused has ν = 0, H = 0 and R = 1, and so no effect on the others.
+    blocks = jnp.where(fuse[:, None, None], noise, jnp.eye(size_z, dtype=noise.dtype))
+    diagonal = jnp.eye(m, dtype=noise.dtype)[:, None, :, None] * blocks[:, :, None]
+    scan_noise = diagonal.reshape(m * size_z, m * size_z)
+
+    def solve(nu: Float[Array, "m Z"], h: Float[Array, "m Z R"]) -> GaussianCorrection:
+        """K ν and the corrected P of the fused measurements: (28)-(30)."""
+        return correct_gaussian(
             jnp.where(fuse[:, None], nu, 0.0).reshape(-1),
             jnp.where(fuse[:, None, None], h, 0.0).reshape(-1, len(robot)),
             state.cov,
             scan_noise,
             joseph=filter.covariance == "joseph",
         )
-        if i == 0:
-            pivots = jnp.diagonal(correction.terms.factor).reshape(m, size_z)
-            log_det, regular = log_det_of_pivots(pivots), (pivots > 0).all(axis=1)
-            report = report_fused(prior, fuse, correction.terms.whitened, log_det, regular)
-        xi = correction.xi
-        pose = chart.retract_pose(robot, xi)
+
+    correction = solve(nu, h)
+    pivots = jnp.diagonal(correction.terms.factor).reshape(m, size_z)
+    log_det, regular = log_det_of_pivots(pivots), (pivots > 0).all(axis=1)
+    report = report_fused(prior, fuse, correction.terms.whitened, log_det, regular)
+    pose = chart.retract_pose(robot, correction.xi)
+    for _ in range(filter.iterations - 1):
+        _, nu, h, _, _ = linearize(pose, correction.xi)
+        # Back to the prior: z ⊖ h(x_i) + H ξ_i.
+        correction = solve(nu + h @ correction.xi, h)
+        pose = chart.retract_pose(robot, correction.xi)
     return state.with_robot(pose)._replace(cov=correction.cov), report

@@ -129,11 +129,12 @@ class FastSlam(ParticleMapFilter):
         scan = zero_padding(scan)
         key_resample, key_draw = jax.random.split(key)
         state = state._replace(best=None)  # a number of the whole state: nothing to map over
+        # Associate and propose, each particle by its own map.
         association = jax.vmap(partial(associate_particle, self, scan=scan))(state)
         proposal, innovations = jax.vmap(partial(propose_pose, self, scan=scan))(state, association)
         state = with_finite_poses(state, proposal.pose, proposal.pose_cov)
-        # w_p ← w_p p(scan | particle), Σ w = 1. Terms of measurements without a landmark compare
-        # particles; they are no densities, so the log-likelihood is without them.
+        # Weigh: w_p ← w_p p(scan | particle), Σ w = 1. Terms of measurements without a landmark
+        # compare particles; they are no densities, so the log-likelihood is without them.
         log_matched = state.log_weight + proposal.log_matched
         log_weight, _, some = normalize(log_matched + proposal.log_unmatched)
         log_likelihood = normalize(log_matched)[1]
@@ -141,8 +142,8 @@ class FastSlam(ParticleMapFilter):
         ess = 1.0 / jnp.exp(2 * log_weight).sum()
         resampled = ess < self.threshold * self.particles
         particles = ParticleInfo(ess, resampled, ~some, invalid=state.invalid.sum())
-        # The weight is marginal over the pose, so resampling comes before the draw: copies of one
-        # particle get different poses. Association and innovations move with their particle.
+        # Resample, before the draw, as the weight is marginal over the pose: copies of one particle
+        # get different poses. Association and innovations move with their particle.
         (state, association, innovations, weight_before), log_weight = resampled_where(
             resampled,
             (state, association, innovations, log_weight),
@@ -150,16 +151,18 @@ class FastSlam(ParticleMapFilter):
             self.resample,
             key_resample,
         )
+        # Draw: from here on a pose is known, and so has no covariance.
         state = state._replace(
             pose=draw_poses(state, key_draw),
             pose_cov=jnp.zeros_like(state.pose_cov),
             log_weight=log_weight,
             invalid=jnp.zeros_like(state.invalid),
         )
+        # Correct and initialize the landmarks of each particle.
         state, infos = jax.vmap(partial(update_map, self, scan=scan))(
             state, association, innovations
         )
-        # After resampling all weights are equal.
+        # Report the most likely particle; after resampling all weights are equal.
         best = jnp.argmax(weight_before).astype(jnp.int32)
         info: Info = jax.tree.map(lambda leaf: leaf[best], infos)
         info = info._replace(

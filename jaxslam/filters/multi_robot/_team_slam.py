@@ -12,7 +12,7 @@ from jaxslam.core._record import record
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate, Info, Scan, Status
 from jaxslam.core.validation import InvalidField
-from jaxslam.filters._ekf.ekf_slam import EkfSlam, update_by_sensor
+from jaxslam.filters._ekf.ekf_slam import EkfSlam, update_by_sensors
 from jaxslam.filters._reporting import join_infos
 from jaxslam.filters.multi_robot._pose_initialization import best_initialization, observed_points
 from jaxslam.filters.multi_robot._team_filter import SIZE, TeamFilter
@@ -187,19 +187,18 @@ def _correct_by_robot(filter: TeamSlam, joint: Joint, robot: int, scan: Scan) ->
     others = jnp.where(jnp.arange(len(in_map)) == robot, False, in_map)
     # Measurements of a robot without a pose in the map, and all by one, cannot correct.
     unknown = (of_robot & ~others[None, :]).any(axis=1) | ~in_map[robot]
-    after = seen_from(filter, joint, robot)
-    ekf, sensors, infos = filter.ekf_of(robot), filter.robots[robot].sensors, []
+    sensors = filter.robots[robot].sensors
     is_robot = jnp.arange(len(joint.alive)) >= filter.capacity
     scans = split_scan(scan._replace(valid=scan.valid & ~unknown), sensors.places)
+    parts = []
     for part, part_scan in zip(sensors.parts, scans, strict=True):
         sensor = on_ground(part.sensor, SIZE)
-        part_scan = part_scan._replace(z=part_scan.z[:, : len(sensor.measurements)])
         births = 0 if part.sees == "robots" else filter.births  # a robot is no new landmark
-        after, info, _, _ = update_by_sensor(
-            ekf, sensor, after, part_scan, births, reserved=is_robot
-        )
-        infos.append(info)
-    info = join_infos(infos, scan.z.shape[1])
+        z = part_scan.z[:, : len(sensor.measurements)]
+        parts.append((sensor, part_scan._replace(z=z), births))
+    after, info, _ = update_by_sensors(
+        filter.ekf_of(robot), seen_from(filter, joint, robot), scan, parts, reserved=is_robot
+    )
     status = jnp.where(scan.valid & unknown, Status.UNMATCHED, info.status)
     info = info._replace(status=status.astype(jnp.int32))
     return seen_from_first(filter, after, robot, joint), info

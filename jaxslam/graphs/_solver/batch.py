@@ -69,7 +69,9 @@ def padded_number(
 def original_number(variable: jax.Array, graph: Graph, padded: Graph) -> jax.Array:
     """The number in the graph of a variable of the padded graph."""
     count, shift = len(padded.poses), len(padded.poses) - len(graph.poses)
-    return _by_numpy(lambda number: number - shift * (number >= count), variable)
+    return _by_numpy(
+        lambda number: number - shift * (number >= count).astype(number.dtype), variable
+    )
 
 
 def cut(arrays: _T, like: PyTree) -> _T:

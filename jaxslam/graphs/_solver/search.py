@@ -410,4 +410,4 @@ def _change_by_rounding(problem: _Problem, search: _Search) -> Float[Array, "B"]
     two_ulp = 2 * float(jnp.finfo(poses.dtype).eps) * jnp.concatenate(largest)[plan.order]
     diagonal = jnp.where(free, diagonal_of(plan, search.system.blocks), 0.0)
     change = dot(diagonal * two_ulp, two_ulp)
-    return jnp.where(change < _RESOLVED * free.sum(axis=(0, 1)), change, 0.0)
+    return jnp.where(change < _RESOLVED * free.sum(axis=(0, 1), dtype=change.dtype), change, 0.0)

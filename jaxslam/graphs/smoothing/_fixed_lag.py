@@ -1,6 +1,7 @@
 """The fixed-lag smoother: the last poses and the map are optimized together at every scan."""
 
 import dataclasses
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -15,7 +16,8 @@ from jaxslam.core.protocols import Associate, Filter, Motion, Sensor
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate, Info, Scan, Status
 from jaxslam.core.validation import InvalidField, at_least, or_none, probability
-from jaxslam.filters._ekf.ekf_slam import EkfSlam
+from jaxslam.filters._ekf.ekf_slam import EkfSlam, associate_scan
+from jaxslam.filters._ekf.predicted_measurements import prediction_of
 from jaxslam.graphs._chain.window import (
     WindowIterate,
     WindowPrior,
@@ -27,6 +29,7 @@ from jaxslam.graphs._chain.window import (
     step_window,
 )
 from jaxslam.graphs.smoothing._forward_pass import joint_ekf
+from jaxslam.linearize._first_order import predicted_noise
 from jaxslam.math import _linalg as linalg
 from jaxslam.math._arrays import Number
 from jaxslam.sensors._suite import Suite
@@ -63,10 +66,10 @@ class FixedLag(Filter):
     with fixed-lag smoothing: algorithm and consistency analysis", ICRA). A window as long as the
     log marginalizes nothing: then the newest pose and the map are those of `BatchMap`.
 
-    A measurement with a singular R is dropped as `Status.SINGULAR`. Where the numbers of the window
-    are not finite (it is optimized without step control), it restarts from the state of EKF-SLAM,
-    and `exhausted` is set. O(W N²) for the window, and
-    O(N³) for the prior, an iteration.
+    A measurement with a singular R(ẑ), or R(z) where it would start a landmark, is dropped as
+    `Status.SINGULAR`. Where the numbers of the window are not finite (it is optimized without step
+    control), it restarts from the state of EKF-SLAM, and `exhausted` is set. O(W N²) for the
+    window, and O(N³) for the prior, an iteration.
 
     Raises ValueError as `EkfSlam` does; on a sensor of another kind, and on a slots, window or
     iterations below 1; from `update`, on a scan of more measurement slots.
@@ -135,11 +138,19 @@ class FixedLag(Filter):
         if scan.z.shape[0] > self.slots:
             reason = f"expected at least {scan.z.shape[0]}, as a scan has, got {self.slots}"
             raise InvalidField("slots", reason, owner="FixedLag")
-        # The window weights by R⁻¹.
-        regular = jax.vmap(lambda z: linalg.cholesky(sensor.noise_cov(z))[1])(scan.z)
-        lost = scan.valid & ~regular
-        kept = scan._replace(valid=scan.valid & regular)
-        joint, info = self._ekf.update(state.joint, kept, key)
+        # The window weights by R⁻¹: R(ẑ) of what EKF-SLAM will match, R(z) of a new landmark.
+        scan = scan._replace(z=jnp.where(scan.valid[:, None], scan.z, 0.0))
+        ekf = self._ekf
+        association, matched = associate_scan(
+            self.associate, sensor, scan, lambda: prediction_of(ekf, sensor, state.joint)
+        )
+        landmark = state.joint.landmarks[jnp.maximum(association.slot, 0)]
+        z_hat = jax.vmap(sensor.observe, (None, 0))(state.joint.pose, landmark)
+        noise = jax.vmap(partial(predicted_noise, sensor))(z_hat, scan.z, matched)
+        regular = jax.vmap(linalg.cholesky)(noise)[1]
+        lost = (matched | association.is_new) & ~regular
+        kept = scan._replace(valid=scan.valid & ~lost)
+        joint, info = ekf.update(state.joint, kept, key)
         status = jnp.where(lost, jnp.int32(Status.SINGULAR), info.status)
         info = info._replace(status=status.astype(info.status.dtype))
         # The window has the measurements that were fused or started landmarks.

@@ -1,5 +1,6 @@
 """Maps from scans at known poses: hits and misses of each cell, and the log-odds by them."""
 
+import math
 from functools import partial
 from numbers import Integral
 from typing import NamedTuple
@@ -24,7 +25,7 @@ from jaxslam.core.validation import (
 from jaxslam.laser.grids._grid import Grid, to_cells
 from jaxslam.laser.grids.beam_models._beam_model import usable_beams
 from jaxslam.math import se2
-from jaxslam.math._arrays import Number
+from jaxslam.math._arrays import Number, in_dtype
 from jaxslam.math._xla import hot_jit
 
 _FARTHEST = 2.0**29
@@ -108,6 +109,7 @@ def count(
             )
     frame = jnp.asarray(origin, float), jnp.asarray(resolution, float)
     eye = jnp.asarray(mount, float)
+    poses, beams = in_dtype((poses, beams), eye.dtype)
     size = int(shape[0]), int(shape[1])
     return _count(size, *frame, poses, beams, max_range, free, eye)
 
@@ -217,7 +219,8 @@ def occupancy(counts: Counts, *, hit: Number = 0.7, miss: ArrayLike = 0.4) -> Gr
         )
     log_hit = jnp.log(hit) - jnp.log1p(-jnp.asarray(hit))
     log_miss = jnp.log(miss) - jnp.log1p(-jnp.asarray(miss))
-    log_odds = counts.hits * log_hit + counts.misses * log_miss
+    dtype = jnp.result_type(log_hit, log_miss)
+    log_odds = counts.hits.astype(dtype) * log_hit + counts.misses.astype(dtype) * log_miss
     return Grid(log_odds, counts.origin, counts.resolution)
 
 
@@ -231,7 +234,9 @@ def reflection(counts: Counts, *, prior: ArrayLike = 1.0) -> Grid:
     """
     if is_concrete(prior) and not float(np.asarray(prior)) > 0:
         raise InvalidField("prior", f"expected a number above 0, got {prior!r}", owner="reflection")
-    log_odds = jnp.log(counts.hits + prior) - jnp.log(counts.misses + prior)
+    dtype = jnp.result_type(prior, float)
+    hits, misses = counts.hits.astype(dtype), counts.misses.astype(dtype)
+    log_odds = jnp.log(hits + prior) - jnp.log(misses + prior)
     return Grid(log_odds, counts.origin, counts.resolution)
 
 
@@ -241,4 +246,4 @@ def entropy(grid: Grid) -> Float[Array, "H W"]:
     odds = jnp.exp(-size)
     # The larger share is 1/(1 + odds), with -log of log1p(odds); the smaller has `size` more.
     nats = jnp.log1p(odds) + size * odds / (1 + odds)
-    return jnp.asarray(nats / np.log(2.0))
+    return jnp.asarray(nats / math.log(2.0))

@@ -149,13 +149,21 @@ def _envelope(column: Int[Array, "W H"]) -> Int[Array, "W H"]:
         crossing = first_cell(h[new * rows + row] - last_h, jnp.where(live, 2 * (new - last), 2))
         remove = live & (crossing <= last_begins)
         add = live & ~remove
-        top = top + add - remove
+        top = top + add.astype(jnp.int32) - remove.astype(jnp.int32)
         at = top * rows + row
         last = jnp.where(add, new, parabola[at])
         last_begins = jnp.where(add, crossing, begins[at])
         parabola = parabola.at[at].set(last, unique_indices=True)
         begins = begins.at[at].set(last_begins, unique_indices=True)
-        return q + add, top, parabola, begins, last, h[last * rows + row], last_begins
+        return (
+            q + add.astype(jnp.int32),
+            top,
+            parabola,
+            begins,
+            last,
+            h[last * rows + row],
+            last_begins,
+        )
 
     zeros = jnp.zeros(rows, jnp.int32)
     begins = jnp.full(width * rows, everywhere, jnp.int32)

@@ -72,9 +72,11 @@ def to_cells(
 def centers(grid: Grid | Field) -> Float[Array, "H W 2"]:
     """The centres of the cells in the world [m]."""
     height, width = grid[0].shape
-    y, x = jnp.meshgrid(jnp.arange(height) + 0.5, jnp.arange(width) + 0.5, indexing="ij")
-    local = grid.resolution * jnp.stack([x, y], axis=-1)
     origin = jnp.asarray(grid.origin)
+    dtype = jnp.result_type(origin, grid.resolution, float)
+    rows, columns = (jnp.arange(size, dtype=dtype) + 0.5 for size in (height, width))
+    y, x = jnp.meshgrid(rows, columns, indexing="ij")
+    local = grid.resolution * jnp.stack([x, y], axis=-1)
     return jnp.einsum("ab,hwb->hwa", se2.rotation(origin[2]), local) + origin[None, None, :2]
 
 

@@ -115,6 +115,26 @@ class _FreeSpace(Region):
     sides: ArrayLike
     """(2, 2) sides of a cell, as rows"""
 
+    @classmethod
+    def of(cls, grid: Grid, box: Float[np.ndarray, "2 2"] | None) -> "_FreeSpace":
+        """The free cells of a map whose centres lie in a box, None for all.
+
+        Raises InvalidField if there is no such cell.
+        """
+        free = np.asarray(grid.log_odds) < 0
+        if not free.any():
+            raise InvalidField("grid", "it has no free cell (log-odds below 0)")
+        origin, cell = np.asarray(grid.origin, np.float64), float(np.asarray(grid.resolution))
+        c, s = np.cos(origin[2]), np.sin(origin[2])
+        sides = cell * np.array([[c, s], [-s, c]])
+        i, j = np.indices(free.shape) + 0.5
+        middle = np.stack([j, i], axis=-1) @ sides + origin[:2]  # (x, y) is (column, row)
+        if box is not None:
+            free = free & ((middle >= box[0]) & (middle <= box[1])).all(axis=2)
+            if not free.any():
+                raise InvalidField("box", f"no free cell of the map is in {box.tolist()}")
+        return cls(middle[free], sides)
+
     def draw(self, count: int, key: Array, dtype: DTypeLike) -> Float[Array, "P 3"]:
         key_cell, key_share = jax.random.split(key)
         places = jnp.asarray(self.places, dtype)
@@ -131,26 +151,6 @@ class _FreeSpace(Region):
         spread = off.T @ off / len(places) + sides.T @ sides / 12
         cov = jnp.zeros((3, 3), dtype).at[:2, :2].set(spread).at[2, 2].set(math.pi**2 / 3)
         return jnp.concatenate([mean, jnp.zeros(1, dtype)]), cov
-
-
-def _free_space(grid: Grid, box: Float[np.ndarray, "2 2"] | None) -> _FreeSpace:
-    """The free cells of a map whose centres lie in a box, None for all.
-
-    Raises InvalidField if there is no such cell.
-    """
-    free = np.asarray(grid.log_odds) < 0
-    if not free.any():
-        raise InvalidField("grid", "it has no free cell (log-odds below 0)")
-    origin, cell = np.asarray(grid.origin, np.float64), float(np.asarray(grid.resolution))
-    c, s = np.cos(origin[2]), np.sin(origin[2])
-    sides = cell * np.array([[c, s], [-s, c]])
-    i, j = np.indices(free.shape) + 0.5
-    middle = np.stack([j, i], axis=-1) @ sides + origin[:2]  # (x, y) is (column, row)
-    if box is not None:
-        free = free & ((middle >= box[0]) & (middle <= box[1])).all(axis=2)
-        if not free.any():
-            raise InvalidField("box", f"no free cell of the map is in {box.tolist()}")
-    return _FreeSpace(middle[free], sides)
 
 
 @record
@@ -210,7 +210,7 @@ class GridLocalization(MonteCarloFilter):
             reason = "expected one outside a trace, since its free cells are found"
             raise InvalidField("grid", reason)
         box = None if self.box is None else np.asarray(self.box)
-        set_field(self, "region", _free_space(self.grid, box))
+        set_field(self, "region", _FreeSpace.of(self.grid, box))
         set_field(self, "prepared", self.model.prepare(self.grid))
         super().__post_init__()
 

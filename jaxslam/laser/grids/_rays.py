@@ -164,24 +164,20 @@ def cast(
             raise InvalidField("angles", "expected finite numbers")
         if isinstance(grid, Grid):
             grid = ray_map(grid, skip=False)
-        _check_on_map(grid, pose)
+        if is_concrete(grid, pose):
+            flat = np.asarray(pose).reshape(-1, 3)
+            c, s = np.cos(grid.origin[2]), np.sin(grid.origin[2])
+            local = (flat[:, :2] - np.asarray(grid.origin)[:2]) @ np.array([[c, -s], [s, c]])
+            height, width = grid.solid.shape
+            size = float(grid.resolution) * np.array([width, height])
+            inside = np.all((local >= 0) & (local <= size), axis=1) & np.isfinite(flat[:, 2])
+            if not inside.all():
+                k = int(np.argmin(inside))
+                off = (
+                    f"pose {k}, {flat[k].tolist()}, is off the map of {size[0]:g} m × {size[1]:g} m"
+                )
+                raise InvalidField("pose", off)
     return _cast(grid, pose, angles, max_range)
-
-
-def _check_on_map(grid: RayMap, pose: Array) -> None:
-    """Raise InvalidField on a pose that is not finite or off the map; nothing within a trace."""
-    if not is_concrete(grid, pose):
-        return
-    flat = np.asarray(pose).reshape(-1, 3)
-    c, s = np.cos(grid.origin[2]), np.sin(grid.origin[2])
-    local = (flat[:, :2] - np.asarray(grid.origin)[:2]) @ np.array([[c, -s], [s, c]])
-    height, width = grid.solid.shape
-    size = float(grid.resolution) * np.array([width, height])
-    inside = np.all((local >= 0) & (local <= size), axis=1) & np.isfinite(flat[:, 2])
-    if not inside.all():
-        k = int(np.argmin(inside))
-        off = f"pose {k}, {flat[k].tolist()}, is off the map of {size[0]:g} m × {size[1]:g} m"
-        raise InvalidField("pose", off)
 
 
 @hot_jit

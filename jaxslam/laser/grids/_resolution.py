@@ -69,9 +69,11 @@ def crop(grid: Grid, low: ArrayLike, high: ArrayLike) -> Grid:
             f"{width} × {height} of {grid.resolution} m",
             owner="crop",
         )
-    shift = jnp.asarray([*(first * float(grid.resolution)), 0.0], jnp.result_type(float))
+    origin = jnp.asarray(grid.origin)
+    to_corner = [*(first * float(grid.resolution)), 0.0]
+    shift = jnp.asarray(to_corner, jnp.result_type(origin, float))
     log_odds = grid.log_odds[first[1] : last[1], first[0] : last[0]]
-    return Grid(log_odds, se2.compose(jnp.asarray(grid.origin), shift), grid.resolution)
+    return Grid(log_odds, se2.compose(origin, shift), grid.resolution)
 
 
 def correlation(a: Grid, b: Grid) -> Float[Array, ""]:
@@ -90,11 +92,10 @@ def correlation(a: Grid, b: Grid) -> Float[Array, ""]:
         require("b", b, grid_map)
     points = centers(a)
     bordered = Grid(jnp.pad(b.log_odds, 1), b.origin, b.resolution)  # unknown off the map
-    corner = jnp.asarray([-1.0, -1.0, 0.0]) * b.resolution
+    corner = jnp.asarray([-1.0, -1.0, 0.0], jnp.result_type(b.resolution, float)) * b.resolution
     frame = se2.compose(jnp.asarray(b.origin), corner), jnp.asarray(b.resolution)
-    weight = a.observed * interpolate(
-        Field(jnp.asarray(bordered.observed, points.dtype), *frame), points
-    )
+    share = interpolate(Field(jnp.asarray(bordered.observed, points.dtype), *frame), points)
+    weight = jnp.where(a.observed, share, 0.0)
     probability_b = interpolate(Field(bordered.probability, *frame), points)
     total = weight.sum()
     total = jnp.where(total > 0, total, 1.0)

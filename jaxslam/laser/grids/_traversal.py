@@ -113,6 +113,16 @@ class _Square(NamedTuple):
     length: Array
 
 
+class _March(NamedTuple):
+    """Rays on their way."""
+
+    at: _Square
+    moving: Array
+    """mask of the rays that go on"""
+    met: Array
+    """mask of the rays that have met a `STOP`, or with corners the surface in one"""
+
+
 def _march_together(
     ahead: Array, corners: Array | None, start: Array, direction: Array, limit: Array
 ) -> tuple[Array, Array]:
@@ -125,7 +135,7 @@ def _march_together(
     | `OFF`, or left beyond the limit | ends without a hit | ends without a hit |
     """
     height, width = ahead.shape
-    x, y = start[:, 0] + 1, start[:, 1] + 1
+    x, y = start[:, 0] + 1, start[:, 1] + 1  # from the corner of the border, a square wide
     # Squares of corners reach half a square beyond the map: a hit there is off the map.
     edge = 1.0 if corners is None else 1.5 - _ROUNDING
 
@@ -138,53 +148,47 @@ def _march_together(
     far = jnp.where(direction != 0, 0.0, jnp.inf)
     rays = _Rays(x, y, *direction.T, *over.T, *far.T)
     # A start on the upper border belongs to the last square.
-    first = _Square(jnp.minimum(x, width - 1.5), jnp.minimum(y, height - 1.5), jnp.zeros_like(x))
-    first = first._replace(x=jnp.floor(first.x), y=jnp.floor(first.y))
+    first = _Square(
+        jnp.floor(jnp.minimum(x, width - 1.5)),
+        jnp.floor(jnp.minimum(y, height - 1.5)),
+        jnp.zeros_like(x),
+    )
+    begin = _March(first, inside, jnp.zeros_like(inside))
 
-    def any_moves(state: tuple[_Square, Array, Array]) -> Array:
-        return state[1].any()
+    def any_moves(march: _March) -> Array:
+        return march.moving.any()
 
-    def free(at: _Square, moving: Array) -> tuple[_Square, Array, Array]:
-        """Rays moved towards the next `STOP`, which of them still move, which have reached one.
-
-        On a CPU all rays arrive. A GPU takes a single step, since there all rays would wait for
-        the longest.
-        """
-
-        def step(state: tuple[_Square, Array, Array]) -> tuple[_Square, Array, Array]:
-            at, moving, stopped = state
-            square = _entries(ahead, at.x, at.y)
-            crosses = _crossings(rays, at)
-            goes = moving & (square < OFF) & (jnp.minimum(*crosses) < limit)
-            after = _next_square(rays, at, crosses, square.astype(x.dtype) * 0.25)
-            return _select(goes, after, at), goes, stopped | (moving & (square == STOP))
-
-        begin = at, moving, jnp.zeros_like(moving)
-        if corners is not None and jax.default_backend() != "cpu":
-            return step(begin)
-        return jax.lax.while_loop(any_moves, step, begin)
+    def step(march: _March) -> _March:
+        """Each ray moved over what is free ahead of it; a `STOP` ends its way."""
+        at, moving, met = march
+        reach = _entries(ahead, at.x, at.y)
+        crosses = _crossings(rays, at)
+        goes = moving & (reach < OFF) & (jnp.minimum(*crosses) < limit)
+        after = _next_square(rays, at, crosses, reach.astype(x.dtype) * 0.25)  # of quarters
+        return _March(_select(goes, after, at), goes, met | (moving & (reach == STOP)))
 
     if corners is None:
-        at, _, hit = free(first, inside)
-        length = at.length
-    else:
+        at, _, met = jax.lax.while_loop(any_moves, step, begin)
+        hit = met & (at.length < limit)
+        return jnp.where(hit, at.length, limit), hit
 
-        def visit(state: tuple[_Square, Array, Array]) -> tuple[_Square, Array, Array]:
-            """Rays moved to the next `STOP`, and out of it if the surface is not in it."""
-            at, moving, hit = state
-            at, moving, stopped = free(at, moving)
-            crosses = _crossings(rays, at)
-            leaves = jnp.minimum(*crosses)
-            meets = _has_root(_parabola(corners, rays, at), leaves - at.length)
-            goes = stopped & ~meets & (leaves < limit)
-            after = _next_square(rays, at, crosses, jnp.zeros_like(leaves))
-            return _select(goes, after, at), moving | goes, hit | (stopped & meets)
+    def visit(march: _March) -> _March:
+        """Rays moved to the next `STOP`, and out of it if the surface is not in it."""
+        none_met = march._replace(met=jnp.zeros_like(march.met))
+        if jax.default_backend() == "cpu":
+            at, moving, stopped = jax.lax.while_loop(any_moves, step, none_met)
+        else:  # one step, since on a GPU all rays would wait for the longest
+            at, moving, stopped = step(none_met)
+        crosses = _crossings(rays, at)
+        leaves = jnp.minimum(*crosses)
+        meets = _has_root(_parabola(corners, rays, at), leaves - at.length)
+        goes = stopped & ~meets & (leaves < limit)
+        after = _next_square(rays, at, crosses, jnp.zeros_like(leaves))
+        return _March(_select(goes, after, at), moving | goes, march.met | (stopped & meets))
 
-        begin = first, inside, jnp.zeros_like(inside)
-        at, _, hit = jax.lax.while_loop(any_moves, visit, begin)
-        length = at.length + _root(_parabola(corners, rays, at))
-        hit = hit & on_map(rays.x + length * rays.dx, rays.y + length * rays.dy)
-    hit = hit & (length < limit)
+    at, _, met = jax.lax.while_loop(any_moves, visit, begin)
+    length = at.length + _root(_parabola(corners, rays, at))
+    hit = met & on_map(rays.x + length * rays.dx, rays.y + length * rays.dy) & (length < limit)
     return jnp.where(hit, length, limit), hit
 
 

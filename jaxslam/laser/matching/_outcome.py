@@ -99,7 +99,7 @@ def mean_score(points: Points, pairs: Pairs, scale: Number) -> Float[Array, ""]:
     """The mean of exp(-½ (e/s)²) over the valid points of a scan, 0 for points without a part."""
     closeness = jnp.exp(-0.5 * (pairs.residual / scale) ** 2)
     closeness = jnp.where(pairs.weight > 0, closeness, 0.0)
-    return closeness.sum() / jnp.maximum(points.valid.sum(), 1)
+    return closeness.sum() / jnp.maximum(points.valid.sum(dtype=closeness.dtype), 1)
 
 
 def length_of(points: Points) -> Float[Array, ""]:

@@ -160,7 +160,18 @@ class Film:
             require("fps", fps, positive)
         self.figure, self.update, self.frames, self.fps = figure, update, frames, float(fps)
         self.title, self.note = title, note
-        _legend(*figure.axes)
+        # The legend of both panels, each label once, below the smaller panel.
+        main, beside = figure.axes
+        handles: dict[str, Artist] = {}
+        for axes in (main, beside):
+            for handle in axes.get_legend_handles_labels()[0]:
+                handles.setdefault(str(handle.get_label()), handle)
+        corner = (0.0, -0.26) if beside.axison else (0.0, 1.0)
+        options: dict[str, Any] = {"frameon": False, "fontsize": TEXT, "borderaxespad": 0.0}
+        options |= {"handlelength": 2.2, "labelspacing": 0.35, "borderpad": 0.0}
+        handles_labels = list(handles.values()), list(handles)
+        legend = beside.legend(*handles_labels, loc="upper left", bbox_to_anchor=corner, **options)
+        legend.set_in_layout(False)
         width, height = figure.get_size_inches()
         figure.text(0.06 / width, 1 - 0.05 / height, title, size=TITLE, va="top", color=INK)
         line: dict[str, Any] = {"size": TEXT, "va": "top", "animated": True}
@@ -276,20 +287,6 @@ def _write_mp4(pictures: Sequence[np.ndarray], fps: float, path: Path) -> str | 
         said = (getattr(error, "stderr", None) or b"").decode(errors="replace").strip()
         return f"ffmpeg: {said.splitlines()[-1].strip() if said else first_line(error)}"
     return None
-
-
-def _legend(main: Axes, beside: Axes) -> None:
-    """The legend of both panels, each label once, below the smaller panel."""
-    handles: dict[str, Artist] = {}
-    for axes in (main, beside):
-        for handle in axes.get_legend_handles_labels()[0]:
-            handles.setdefault(str(handle.get_label()), handle)
-    corner = (0.0, -0.26) if beside.axison else (0.0, 1.0)
-    options: dict[str, Any] = {"frameon": False, "fontsize": TEXT, "borderaxespad": 0.0}
-    options |= {"handlelength": 2.2, "labelspacing": 0.35, "borderpad": 0.0}
-    handles_labels = list(handles.values()), list(handles)
-    legend = beside.legend(*handles_labels, loc="upper left", bbox_to_anchor=corner, **options)
-    legend.set_in_layout(False)
 
 
 _ROBOT = np.array([[1.0, 0.0], [-0.6, 0.55], [-0.6, -0.55]])

@@ -189,7 +189,7 @@ _OUTCOMES = {
 
 
 def beams_of(history: History) -> tuple[dict[str, list[np.ndarray]], dict[str, list[int]]]:
-    """By outcome: the ends (E, 2, 2) of the beams since the previous frame, and their numbers.
+    """The beams since the previous frame, by outcome: their ends (E, 2, 2), and their numbers.
 
     A beam begins where the robot was estimated in that step, and ends at the landmark's estimate in
     the frame. A dropped measurement has the landmark of its tag; one of no landmark in the map is

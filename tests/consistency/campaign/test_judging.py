@@ -33,6 +33,7 @@ WORLDS = {
     "cloister": dataclasses.replace(CLOISTER, landmarks=np.asarray(CLOISTER.landmarks)[::4]),
     "bearings": columns_alone(CLOISTER, sensors.BearingOnly([[0.02**2]], free=([4.0], [[1.5**2]]))),
     "ranges": columns_alone(CLOISTER, sensors.RangeOnly([[0.1**2]], free=([0.0], [[0.5**2]]))),
+    "further states": worlds.gyroscope(STEPS),
 }
 
 
@@ -58,7 +59,7 @@ def same(a, b, without=()):
         assert a.counts[name] == b.counts[name]
 
 
-@pytest.mark.parametrize("name", swept(WORLDS, "circle", "ranges"))
+@pytest.mark.parametrize("name", swept(WORLDS, "circle", "ranges", "further states"))
 def test_our_ekf_as_a_stranger_has_every_number_of_the_campaign(name):
     world = WORLDS[name]
     ekf = catalog.FILTERS["ekf"](world)
@@ -278,6 +279,30 @@ def test_maps_of_worlds_without_identities_are_not_judged(ring):
     assert not summary.measures.keys() & {"rmse_landmarks", "nees_landmarks", "precision"}
 
 
+def test_what_is_beside_the_pose_is_judged_where_it_is_handed_over():
+    """By NumPy; covariances that are none are counted, and named."""
+    world = worlds.gyroscope(STEPS)
+    sigma, drawn = np.array([0.02, 0.01]), np.random.default_rng(0).standard_normal((4, STEPS, 2))
+    covs = np.tile(np.diag(sigma**2), (STEPS, 1, 1))
+
+    def change(number, poses, pose_covs):
+        truth, _ = world_of_run(world, KEY, number)
+        further = np.asarray(truth.further) - sigma * drawn[number]
+        if number == 1:
+            return poses, pose_covs
+        own = np.tile([[1e-4, 1e-3], [1e-3, 1e-4]], (STEPS, 1, 1)) if number == 3 else covs
+        return RunEstimate(poses, pose_covs, further=further, further_covs=own)
+
+    summary = judge_estimator(world, by_number(world, change), 4, KEY, **ONE).filters["estimator"]
+    judged = drawn[[0, 2]] ** 2
+    expected = {"nees_of_bias": judged[..., 0], "nees_of_scale": judged[..., 1]}
+    expected["nees_further"] = judged.mean(axis=2)
+    for name, values in expected.items():
+        assert summary.measures[name].value == pytest.approx(values.mean(), rel=1e-9)
+    assert summary.faults == {"has no covariance beside the pose": (3,)}
+    assert summary.counts["runs"] == 3 and "run 3: first at row 0" in summary.doubts[0]
+
+
 EYE = np.tile(np.eye(3), (10, 1, 1))
 NU = [0], [0], [[0.0, 0.0]], [np.eye(2)]
 
@@ -313,6 +338,16 @@ NU = [0], [0], [[0.0, 0.0]], [np.eye(2)]
         lambda log: RunEstimate(np.zeros((10, 3)), EYE, None, ([0], [0], [[0.0]], [[[1.0]]])),
         {},
         "innovations: expected ν of 2 numbers, as a measurement has, got 1",
+    ),
+    (
+        lambda log: RunEstimate(np.zeros((10, 3)), EYE, further=np.zeros((10, 1))),
+        {},
+        "further: expected both or none of further and further_covs",
+    ),
+    (
+        lambda log: RunEstimate(np.zeros((10, 3)), EYE, None, None, EYE[:, 0, :1], EYE[:, :1, :1]),
+        {},
+        "further: expected 0 numbers a row, as the robot has beside its pose, got 1",
     ),
     (len, {"stride": 3}, "judge_estimator: stride: expected a divisor of the 10 steps, got 3"),
     (len, {"name": " "}, "judge_estimator: name: expected a name, as 'mine', got ' '"),

@@ -8,10 +8,21 @@ import numpy as np
 import pytest
 
 import jaxslam
-from jaxslam import Scenario, _origin, charts, filters, motion, sensors, simulate, simulation
+from jaxslam import (
+    Scenario,
+    _origin,
+    catalog,
+    charts,
+    filters,
+    motion,
+    sensors,
+    simulate,
+    simulation,
+)
 from jaxslam.core.protocols import Sensor
 from jaxslam.core.record import record
 from jaxslam.core.types import Status
+from jaxslam.graphs.smoothing import FixedLag
 
 KEY = jax.random.key(0)
 UTM = np.array([5e5, 5e6])
@@ -49,7 +60,8 @@ def test_a_vague_start_in_float32_is_doubted_with_the_numbers_of_both_precisions
     single, double = (campaign_of(VAGUE, dtype=dtype) for dtype in ("float32", "float64"))
     assert double.filters["ekf"].doubts == double.filters["root"].doubts == ()
     (doubt,) = single.filters["ekf"].doubts
-    assert "in float32 and in float64, pose NEES" in doubt and "x64" in doubt
+    assert "in float32 and in float64, pose NEES" in doubt
+    assert 'set jax_enable_x64, or give the filter covariance="square_root"' in doubt
     assert doubt in " ".join(str(single).split())
     # The number said of float64 is that of the campaign in float64.
     run = int(doubt.split("run ")[1].split()[0])
@@ -61,6 +73,35 @@ def test_a_vague_start_in_float32_is_doubted_with_the_numbers_of_both_precisions
     for name in ("nees_pose", "nis_per_dof"):
         values = (each.filters["root"].per_run[name] for each in (single, double))
         np.testing.assert_allclose(*values, rtol=0.02)
+
+
+def families(world):
+    """Methods other than EKF-SLAM."""
+    models = world.motion, world.sensor
+    return {
+        "mapping": catalog.ALL["mapping"](world),
+        "eif": filters.EifSlam(*models, 4),
+        "seif": filters.Seif(*models, 4, active=4, links=4),
+        "fixed lag": FixedLag(*models, 4, 4, window=3),
+        "fastslam": filters.FastSlam(*models, 4, particles=20),
+    }
+
+
+@pytest.mark.sweep
+@pytest.mark.parametrize("origin", [0.0, 5e6])
+@pytest.mark.parametrize("name", families(NEAR))
+def test_a_start_known_to_a_kilometre_has_the_verdict_of_float64_or_a_doubt(name, origin):
+    """The filter of float64 at origin 0; and no advice that a filter cannot follow."""
+    near, far = world_of(1000.0), world_of(1000.0, (origin, origin))
+    options = {"block": 8, "devices": jax.devices()[:1]}
+    double, single = (
+        jaxslam.monte_carlo(world, {name: families(world)[name]}, 16, KEY, dtype=dtype, **options)
+        for world, dtype in ((near, "float64"), (far, "float32"))
+    )
+    summary = single.filters[name]
+    doubts = [doubt for doubt in summary.doubts if "float32" in doubt]
+    assert doubts or summary.verdict == double.filters[name].verdict
+    assert not any("square_root" in doubt for doubt in doubts)
 
 
 @pytest.mark.parametrize(("dtype", "rtol"), [("float32", 1e-5), ("float64", 1e-6)])

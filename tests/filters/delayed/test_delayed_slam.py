@@ -15,6 +15,7 @@ from worlds import draw, judged, nameless, narrow
 import jaxslam
 from jaxslam import Scenario, motion, sensors
 from jaxslam.association import Nearest
+from jaxslam.core.record import record
 from jaxslam.core.types import Status
 from jaxslam.filters import (
     DeadReckoning,
@@ -231,7 +232,7 @@ def test_a_confirmed_hypothesis_moves_and_nothing_else(kind, differences):
     gain = cov @ rows.T / s
     gain[np.delete(np.arange(len(gain)), [9, 10])] = 0
     left = np.eye(len(cov)) - gain @ rows
-    part = (found.value[:, 0], found.by_point[:, 0], found.by_stored[:, 0])
+    part = (found.value[:, 0], found.by_point[:, 0], found.by_stored[:, 0], jnp.zeros(2))
     constraint = CONSTRAINTS(joint, slots, jnp.asarray([6, 6]), *part)
     new = CORRECT(joint, LAYOUT, constraint, jnp.asarray([True, False]))
     np.testing.assert_allclose(new.cov, left @ cov @ left.T, atol=1e-9 * cov.max())
@@ -242,41 +243,85 @@ def test_a_confirmed_hypothesis_moves_and_nothing_else(kind, differences):
     np.testing.assert_array_equal(new.landmarks[4:], joint.landmarks[4:])
 
 
-@EACH_KIND
-def test_a_landmark_of_all_its_measurements_is_the_constrained_least_squares(kind, differences):
-    """Against the solution of minimize δᵀP⁻¹δ subject to the four constraints, by one inverse."""
+@record
+class Growing:
+    """The variance of one number that grows with its size."""
+
+    share: float
+
+    def __call__(self, z):
+        return jnp.square(0.003 + self.share * jnp.abs(z))[:, None]
+
+
+OF_STORED = np.array([17, 20, 23, 26])
+"""the rows of the four values q"""
+
+
+def noisy(kind, share):
+    """`table` with a noise R(z) of each value, and errors of that size; and the noise."""
+    factory = sensors.BearingOnly if kind == "rays" else sensors.RangeOnly
     joint = table(kind)
+    z = np.asarray(joint.landmarks)[4:, 2:] - 0.3 * (kind == "rays")  # the heading
+    z = z + share * z * np.array([[0.3], [-0.4], [0.5], [-0.2]])
+    landmarks = joint.landmarks.at[4:, 2:].set(z + 0.3 * (kind == "rays"))
+    variance = (0.003 + share * np.abs(z[:, 0])) ** 2
+    cov = joint.cov.at[OF_STORED, OF_STORED].add(variance)
+    noise = hypotheses.StoredNoise(factory(Growing(share)), jnp.asarray(z), jnp.ones(4))
+    return joint._replace(landmarks=landmarks, cov=cov), noise
+
+
+@pytest.mark.parametrize("share", [0.0, 0.1])
+@EACH_KIND
+def test_a_landmark_of_all_its_measurements_is_the_constrained_least_squares(
+    kind, share, differences
+):
+    """Against the solution of minimize δᵀP⁻¹δ subject to the four constraints, by one inverse; P
+    with R(ẑ) of the solution, though the table has R(z)."""
+    joint, noise = noisy(kind, share)
     stored = jnp.asarray([4, 5, 6, 7, 4])
     use = jnp.asarray([True, True, True, True, False])
     start = jnp.asarray([1.1, 5.1])
-    found = ESTIMATE(joint, KINDS[kind], start, stored, use)
+    of_rows = noise._replace(z=noise.z[stored - 4], by_z=noise.by_z[stored - 4])
+    found = ESTIMATE(joint, KINDS[kind], of_rows, start, stored, use)
     new = ADD_LANDMARK(joint, found, jnp.asarray(1), stored)
+
+    def predicted(value):
+        """P with R(ẑ)."""
+        z, cov = np.asarray(noise.z)[:, 0], np.array(joint.cov)
+        sigma, at_z = (0.003 + share * np.abs(x) for x in (z - value, z))
+        cov[OF_STORED, OF_STORED] += sigma**2 - at_z**2
+        return cov
+
     # At the point where Gauss-Newton ends, the linear problem in plain NumPy.
     point = np.array([1.1, 5.1])
     for _ in range(20):
         value, rows, by_point = jacobian_rows(kind, joint, point, [4, 5, 6, 7], differences)
-        weight = np.linalg.inv(rows @ np.asarray(joint.cov) @ rows.T)
+        weight = np.linalg.inv(rows @ predicted(value) @ rows.T)
         lhs = by_point.T @ weight @ by_point
         point = point - np.linalg.solve(lhs, by_point.T @ weight @ value)
     value, rows, by_point = jacobian_rows(kind, joint, point, [4, 5, 6, 7], differences)
     live = np.r_[0:5, 15:27]
     n = len(live)
     system = np.zeros((n + 6, n + 6))
-    system[:n, :n] = np.linalg.inv(np.asarray(joint.cov)[np.ix_(live, live)])
+    system[:n, :n] = np.linalg.inv(predicted(value)[np.ix_(live, live)])
     system[n + 2 :, :n] = rows[:, live]
     system[n + 2 :, n : n + 2] = by_point
     system[:, n + 2 :] = system[n + 2 :].T
     inverse = np.linalg.inv(system)
     moved = inverse @ np.concatenate([np.zeros(n + 2), -value])
     rows = np.r_[live, 6, 7]
+    # The values themselves are then deleted; where R varies, their rows are as with R(z).
+    kept = np.flatnonzero(~np.isin(rows, OF_STORED) | (share == 0))
     np.testing.assert_allclose(
-        np.asarray(new.cov)[np.ix_(rows, rows)], inverse[: n + 2, : n + 2], atol=1e-9
+        np.asarray(new.cov)[np.ix_(rows[kept], rows[kept])],
+        inverse[: n + 2, : n + 2][np.ix_(kept, kept)],
+        atol=1e-9,
     )
     np.testing.assert_allclose(new.landmarks[1, :2], point + moved[n : n + 2], atol=1e-6)
     np.testing.assert_allclose(new.pose, joint.pose + moved[:3], atol=1e-7)
-    np.testing.assert_allclose(
-        new.landmarks[4:].reshape(-1), joint.landmarks[4:].reshape(-1) + moved[5:n], atol=1e-7
-    )
+    columns = slice(0, 3 if share == 0 else 2)
+    off = np.asarray(new.landmarks - joint.landmarks)[4:] - moved[5:n].reshape(4, 3)
+    np.testing.assert_allclose(off[:, columns], 0, atol=1e-7)
     assert found.regular
     step = moved[:n]
     cost = step @ system[:n, :n] @ step
@@ -406,6 +451,33 @@ def test_the_filter_is_honest(many):
         assert mean < 1.5 * dof, name
 
 
+@pytest.mark.sweep
+def test_ranges_whose_noise_grows_leave_the_filter_honest():
+    """σ of 3 mm and 5, 10 and 20 % of the range. Stored a metre apart: with so much noise, places
+    that are closer determine no point, and with a constant σ of 25 cm neither."""
+    shares, runs = np.array([0.05, 0.1, 0.2]), 16
+
+    def of_run(share, key):
+        scenario = dataclasses.replace(world("circles"), sensor=sensors.RangeOnly(Growing(share)))
+        filter = DelayedSlam(
+            scenario.motion,
+            scenario.sensor,
+            5,
+            stored=StoredMeasurements(capacity=60, spacing=1.0),
+            hypotheses=Hypotheses(capacity=12),
+            promotion=Promotion(persistence=7.0),
+        )
+        trace = go(filter, jaxslam.simulate(scenario, key)[1])
+        return trace.info.nis.sum(), trace.info.dof.sum(), trace.estimate.alive[-1].sum()
+
+    over_runs = jax.vmap(jax.vmap(of_run, (None, 0)), (0, None))
+    keys = jax.random.split(jax.random.key(7), runs)
+    nis, dof, count = map(np.asarray, jax.jit(over_runs)(shares, keys))
+    assert (count.mean(axis=1) > 1).all()
+    off = nis.sum(axis=1) / dof.sum(axis=1) - 1
+    assert (np.abs(off) < 3.5 * np.sqrt(2 / dof.sum(axis=1))).all()
+
+
 SMALL = {
     "stored": StoredMeasurements(capacity=15),
     "hypotheses": Hypotheses(capacity=6),
@@ -515,9 +587,10 @@ def test_in_reverse_intersections_and_residuals_are_as_forward(kind):
 def test_in_reverse_what_makes_a_landmark_is_as_forward():
     """A hypothesis formed and confirmed, a point fitted and entered, by means and covariances."""
     kind = "rays"
-    joint = table(kind)
+    joint, noise = noisy(kind, 0.01)
     which = closest_point(kind, joint.landmarks[4:6])
     stored, use = jnp.array([4, 5, 6, 7, 4]), jnp.arange(5) < 4
+    of_rows = noise._replace(z=noise.z[stored - 4], by_z=noise.by_z[stored - 4])
 
     def loss(landmarks, cov):
         start = joint._replace(landmarks=landmarks, cov=cov)
@@ -525,12 +598,14 @@ def test_in_reverse_what_makes_a_landmark_is_as_forward():
         slots = jnp.array([2, 3])
         residuals = hypotheses.point_residuals(new, KINDS[kind], slots, jnp.array([6, 7]))
         part = residuals.value[:, 0], residuals.by_point[:, 0], residuals.by_stored[:, 0]
+        newest = noise._replace(z=noise.z[2:], by_z=noise.by_z[2:])
+        part = *part, jax.vmap(newest.change)(residuals.value)[:, 0]
         constraint = confirmation.constraints_of(new, slots, jnp.array([6, 6]), *part)
         corrected = confirmation.correct_hypotheses(
             new, LAYOUT, constraint, jnp.array([True, False])
         )
         estimate = initialization.initial_estimate(
-            start, KINDS[kind], jnp.array([1.1, 5.1]), stored, use
+            start, KINDS[kind], of_rows, jnp.array([1.1, 5.1]), stored, use
         )
         entered = initialization.add_landmark(start, estimate, jnp.asarray(1), stored)
         parts = [(x.landmarks**2).sum() + (x.cov**2).sum() for x in (corrected, entered)]

@@ -155,7 +155,7 @@ def test_in_reverse_through_a_motion_and_corrections_in_turn(name):
         robot = motion.Increment(jnp.diag(sigma[:2]) ** 2)
         ekf = EkfSlam(robot, sensor, 2, **FORMS[name])
         joint = ekf.predict(joint, jnp.array([0.2, 0.1]), jax.random.key(0))
-        joint, done = correct_in_turn(ekf, sensor, joint, z, slot, np.ones(3, bool))
+        joint, done = correct_in_turn(ekf, sensor, joint, z, slot, np.ones(3, bool), None)
         return done.log_likelihood.sum() + joint.pose.sum() + (joint.cov**2).sum()
 
     at = np.array([0.01, 0.04, 0.05, 0.02])

@@ -101,7 +101,7 @@ def test_a_scan_judged_for_association_is_judged_alike_in_the_correction():
     @jax.jit
     def judged(joint, scan):
         pairs = predicted_measurements.prediction_of(ekf, SENSOR, joint).pairs(scan)
-        return pairs, correction.correct(ekf, SENSOR, joint, scan.z, slot, scan.valid)[1]
+        return pairs, correction.correct(ekf, SENSOR, joint, scan.z, slot, scan.valid, None)[1]
 
     pairs, done = jax.device_get(judged(joint, scan))
     np.testing.assert_allclose(pairs.innovation[measurement, slot], done.innovation, atol=1e-12)

@@ -302,7 +302,7 @@ def test_relocated_is_the_limit_of_an_update_from_a_large_covariance(name):
     # Linearized at the answer, the same update from a large covariance hardly moves the pose.
     wide = LOST(joint._replace(pose=found.pose), chart, 1e7 * np.eye(3))
     ekf = EkfSlam(motion.Increment(np.eye(2)), sensor, len(joint.tag), chart=chart)
-    correction = jax.jit(lambda *scan: correct(ekf, sensor, *scan))
+    correction = jax.jit(lambda *scan: correct(ekf, sensor, *scan, None))
     limit, _ = correction(wide, seen, np.maximum(slot, 0), slot >= 0)
     tolerance = 1e-5 if name == "euclidean" else 1e-3  # basis at the answer, or before it
     np.testing.assert_allclose(found.pose, limit.pose, atol=tolerance)

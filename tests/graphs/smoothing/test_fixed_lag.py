@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import worlds
 from cases import refused
-from test_smoothing import KEY, P0, START, arguments, linear_log, linear_world, regular
+from test_smoothing import KEY, MARK, P0, START, F, arguments, linear_log, linear_world, regular
 
 from jaxslam import motion, run, sensors, simulate
 from jaxslam.core.types import Log, Scan, Status
@@ -82,6 +82,30 @@ def test_in_a_linear_world_it_is_the_kalman_filter():
     exact = log.scan.valid & ~regular(log)
     assert exact.sum() == 1
     assert (np.asarray(trace.info.status)[exact] == Status.SINGULAR).all()
+
+
+def test_a_noise_is_singular_by_the_prediction_of_a_landmark_and_the_measurement_of_a_new_one():
+    """At the second step: a measurement that claims to be exact whose prediction does not, one that
+    does not whose prediction does, and a new landmark that does."""
+    start, tags = np.array(START), np.arange(3, dtype=np.int32)
+    control, z = np.tile(start - F @ start, (9, 1)), np.zeros((9, 3, 2))
+    control[1, 0] -= 0.2  # all are predicted farther by 0.2
+    z[0, :, 0] = [MARK - 3.5, MARK - 0.1, 0.0]
+    z[1, :, 0] = [MARK + 0.1, MARK - 0.2, MARK + 0.1]
+    valid = np.zeros((9, 3), bool)
+    valid[0, :2] = valid[1] = True
+    log = Log(control, Scan(z, np.where(valid, tags, -1), valid))
+    moves, sees = linear_world()
+    trace = run(FixedLag(moves, sees, 4, 4, window=3, iterations=1), log, START, P0, KEY)
+    expected = [Status.FUSED, Status.SINGULAR, Status.SINGULAR]
+    np.testing.assert_array_equal(trace.info.status[1], expected)
+    np.testing.assert_array_equal(trace.info.slot[1], [0, -1, -1])
+    valid[1] = [True, False, False]
+    used = log._replace(scan=log.scan._replace(valid=valid))
+    kalman = run(EkfSlam(moves, sees, 4, correction="joint"), used, START, P0, KEY)
+    pairs = (jax.tree.leaves(each.estimate) for each in (trace, kalman))
+    for ours, theirs in zip(*pairs, strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-8, atol=1e-10)
 
 
 @pytest.mark.sweep

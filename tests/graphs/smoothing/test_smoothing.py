@@ -47,6 +47,7 @@ MARK = 5.0  # a measurement predicted beyond claims to be exact
 FAR = 6  # the only step from which one is
 
 
+@cache
 def linear_world():
     """Affine models; two noises for three coordinates; landmarks that come into view late."""
     moves = motion_of(

@@ -94,7 +94,8 @@ class Hessian(MatchCovariance):
         prepared = matcher.prepare(reference)
         # With a prior the pose is no free parameter of the residuals.
         free = (match.weight > 0).sum() - (3 if match.prior is None else 0)
-        least = 2 * matcher.cost(prepared, points, match.pose, match) / jnp.maximum(free, 1)
+        free = jnp.maximum(free, 1).astype(match.weight.dtype)
+        least = 2 * matcher.cost(prepared, points, match.pose, match) / free
         shape = curvature(matcher, prepared, points, match)
         return least * inverse_of(shape, add_prior(match, match.information))
 

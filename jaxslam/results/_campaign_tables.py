@@ -1,17 +1,19 @@
-"""The rows of the table of a campaign, shared by text, HTML and CSV, and notes on its terms."""
+"""The tables of a campaign and of two filters in pairs, and notes on their terms."""
 
-from collections.abc import Sequence
-from typing import NamedTuple, TypeAlias
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
+from html import escape
 
 import numpy as np
 
 from jaxslam.consistency import Average, PairedDifference, Summary
 from jaxslam.consistency._intervals import EACH, LEVEL, is_lopsided, percentage
-from jaxslam.consistency._measures import REGISTRY, measures_of
+from jaxslam.consistency._measures import REGISTRY, Measure, measures_of
 from jaxslam.consistency._measures.counts import MEANINGS, count_label
 from jaxslam.consistency._measures.nees import DOF
 from jaxslam.consistency._verdict import TESTS
 from jaxslam.consistency.campaign import Campaign, Comparison
+from jaxslam.core._table import Cell, Row, Table
 from jaxslam.math.stats import normal_quantile
 
 VERDICTS = {
@@ -48,50 +50,47 @@ _NEVER = ("steps",)
 """Counts that only doubts show."""
 
 
-class Figure(NamedTuple):
-    """A cell without an interval."""
-
-    text: str
-    value: float | None = None
-    """the number in CSV, where the text is not written"""
-
-
-Cell: TypeAlias = Summary | Average | Figure | None
-"""A summary shows its verdict."""
-
-
-class Row(NamedTuple):
-    """A row of the table, with a cell per filter."""
-
-    label: str
-    """a label that starts with a space belongs to the row above"""
-    honest: str
-    """the value of a consistent filter, if known"""
-    cells: Sequence[Cell]
-    published: Sequence[float | None] = ()
-    """published value of each filter; empty if no filter has one"""
-    group: str = ""
-    """heading above the rows, on a page"""
-    level: float = EACH
-    """level of the intervals"""
-
-
-def cell_text(cell: Cell) -> str:
-    """A cell as text: a verdict with the tests that rejected, and an asterisk if it has doubts."""
-    if cell is None:
-        return "-"
-    if isinstance(cell, Summary):
-        tests = [TESTS[name].removeprefix("pose ").removesuffix(" / dof") for name in cell.by]
-        rejected = f" ({', '.join(tests)})" * bool(tests)
-        return cell.verdict + rejected + "*" * bool(cell.doubts)
-    if not isinstance(cell, Average):
-        return cell.text
-    value, low, high = cell
+def average_text(average: Average) -> str:
+    """A measure as text, with half of its interval, or with the ends of one that is lopsided."""
+    value, low, high = average
     if not (np.isfinite(low) or np.isfinite(high)) or (low, high) == (0.0, np.inf):
         return short(value)
-    if is_lopsided(cell):
+    if is_lopsided(average):
         return f"{short(value)} [{short(low, 3)}, {short(high, 3)}]".replace("inf", "∞")
     return f"{short(value)} ± {short((high - low) / 2, 2)}"
+
+
+def _average(average: Average | None, level: float) -> Cell | None:
+    """The cell of a measure; the pointer shows its interval, of that level."""
+    if average is None:
+        return None
+    title = ""
+    if np.isfinite(average.high):
+        digits = 1 if level == EACH else 0
+        title = f"{percentage(level, digits)} interval {average.low:.5g} to {average.high:.5g}"
+    return Cell(average_text(average), average, title)
+
+
+def _numbers(values: Iterable[float | None], text: Callable[[float], str]) -> list[Cell | None]:
+    """The cells of numbers; none where there is no number."""
+    return [None if value is None else Cell(text(value), [value]) for value in values]
+
+
+def _honest(measure: Measure) -> str:
+    return "" if measure.honest is None else f"{measure.honest:g}"
+
+
+def badge(verdict: str, summary: Summary | None = None) -> str:
+    """A verdict as HTML, with the tests that rejected; with doubts it has an asterisk, and is grey
+    if consistent."""
+    sign, meaning = VERDICTS[verdict]
+    rejected = [TESTS[test] for test in summary.by] if summary is not None else []
+    doubts = summary.doubts if summary is not None else ()
+    kind = "undecided" if doubts and verdict == "consistent" else verdict
+    title = escape("; ".join([meaning, *doubts]))
+    text = escape(verdict + f" ({', '.join(rejected)})" * bool(rejected))
+    mark = f'<span aria-hidden="true">{sign}{"*" * bool(doubts)}</span>'
+    return f'<span class="badge {kind}" title="{title}">{mark} {text}</span>'
 
 
 def short(value: float, digits: int = 4) -> str:
@@ -99,45 +98,50 @@ def short(value: float, digits: int = 4) -> str:
     return f"{value:,.0f}" if 10**digits <= abs(value) < 1e6 else f"{value:.{digits}g}"
 
 
-def rows_of(campaign: Campaign, names: Sequence[str]) -> list[Row]:
-    """The rows of the table of some filters, without measures that none of them has."""
-    summaries = [campaign.filters[name] for name in names]
-    rows = [Row("verdict", "consistent", summaries)]
+def table_of(campaign: Campaign) -> Table:
+    """The table of the filters, without measures that none of them has.
+
+    A verdict has the tests that rejected, and an asterisk if it has doubts.
+    """
+    names, summaries = list(campaign.filters), list(campaign.filters.values())
+    verdicts = []
+    for summary in summaries:
+        tests = [TESTS[name].removeprefix("pose ").removesuffix(" / dof") for name in summary.by]
+        rejected = f" ({', '.join(tests)})" * bool(tests)
+        text = summary.verdict + rejected + "*" * bool(summary.doubts)
+        verdicts.append(Cell(text, html=badge(summary.verdict, summary)))
+    rows = [Row("verdict", ["consistent", *verdicts])]
     for measure in measures_of(key for s in summaries for key in s.measures):
-        if not measure.row:
-            continue
-        cells = [s.measures.get(measure.key) for s in summaries]
-        published = [campaign.published.get(name, {}).get(measure.key) for name in names]
-        has_published = any(value is not None for value in published)
-        if has_published or any(cell is not None for cell in cells):
-            honest = "" if measure.honest is None else f"{measure.honest:g}"
-            rows.append(Row(measure.title, honest, cells, published if has_published else ()))
+        if measure.row:
+            cells = [_average(s.measures.get(measure.key), EACH) for s in summaries]
+            rows.append(Row(measure.label, [_honest(measure), *cells], measure.unit))
+            published = [campaign.published.get(name, {}).get(measure.key) for name in names]
+            rows.append(Row("  published", ["", *_numbers(published, short)]))
     # The bands of honest filters, and the share of steps within them.
-    nis = [s.nis_band and Figure("[{:.4f}, {:.4f}]".format(*s.nis_band)) for s in summaries]
+    nis = [s.nis_band and "[{:.4f}, {:.4f}]".format(*s.nis_band) for s in summaries]
     half_widths = [s.autocorrelation_band[0] for s in summaries]
-    white = [Figure(f"± {half:.4f}") if np.isfinite(half) else None for half in half_widths]
+    white = [f"± {half:.4f}" if np.isfinite(half) else None for half in half_widths]
     for name, bands in (("NIS / dof", nis), ("autocorrelation", white)):
-        if any(band is not None for band in bands):
-            rows.append(Row(f"{name}, {percentage(LEVEL)} band", "", bands, group="Bands"))
+        rows.append(Row(f"{name}, {percentage(LEVEL)} band", ["", *bands], group="Bands"))
     for block in DOF:
-        shares = [s.inside.get(block) for s in summaries]
-        figures = [None if p is None else Figure(percentage(p, 1), p) for p in shares]
-        rows.append(Row(f"steps in {block} band", percentage(LEVEL, 1), figures, group="Bands"))
-    # The time of a step, and counts that are not 0 for all filters.
-    times = [campaign.step_seconds.get(name) for name in names]
-    if any(times):
-        figures = [None if t is None else Figure(f"{1e6 * t:.3g}", 1e6 * t) for t in times]
-        rows.append(Row("time of a step [µs]", "", figures, group="Time and counts"))
-    runs = [campaign.run_seconds.get(name) for name in names]
-    if any(runs):
-        figures = [None if t is None else Figure(f"{t:.3g}", t) for t in runs]
-        rows.append(Row("wall time of a run [s]", "", figures, group="Time and counts"))
+        shares = _numbers([s.inside.get(block) for s in summaries], partial(percentage, digits=1))
+        honest = percentage(LEVEL, 1)
+        rows.append(Row(f"steps in {block} band", [honest, *shares], group="Bands"))
+    # Times, and counts that are not 0 for all filters.
+    steps = {name: 1e6 * seconds for name, seconds in campaign.step_seconds.items()}
+    for label, of, unit in (
+        ("time of a step", steps, "µs"),
+        ("wall time of a run", campaign.run_seconds, "s"),
+    ):
+        times = _numbers([of.get(name) for name in names], "{:.3g}".format)
+        rows.append(Row(label, ["", *times], unit, group="Time and counts"))
     for key in dict.fromkeys(key for s in summaries for key in s.counts):
-        numbers = [s.counts.get(key) for s in summaries]
-        if key not in _NEVER and (key in _ALWAYS or any(numbers)):
-            figures = [None if n is None else Figure(f"{n:,}", n) for n in numbers]
-            rows.append(Row(count_label(key), "", figures, group="Time and counts"))
-    return rows
+        counts = [s.counts.get(key) for s in summaries]
+        if key not in _NEVER and (key in _ALWAYS or any(counts)):
+            numbers = _numbers(counts, "{:,}".format)
+            rows.append(Row(count_label(key), ["", *numbers], group="Time and counts"))
+    rows = [row for row in rows if any(cell is not None for cell in row.cells[1:])]
+    return Table(["measure", "honest", *names], rows, fixed=1)
 
 
 def notes_on(campaign: Campaign) -> list[tuple[str, str]]:
@@ -187,31 +191,27 @@ def lost_runs(campaign: Campaign) -> list[tuple[str, str]]:
     return phrases
 
 
-def heads_of_pairs(comparison: Comparison) -> list[str]:
-    """The heads of the cells of `rows_of_pairs`."""
-    return [comparison.first, comparison.second, "difference", "better in", "narrower by"]
-
-
-def rows_of_pairs(comparison: Comparison) -> list[Row]:
-    """The rows of the table of two filters, with a cell per head of `heads_of_pairs`."""
+def table_of_pairs(comparison: Comparison) -> Table:
+    """The table of two filters: averages, difference, and what it says."""
     rows = []
     for key, pair in comparison.measures.items():
         measure, share, factor = REGISTRY[key], pair.share, pair.narrower
         times = f"{factor:#.3g}".rstrip(".") if factor < np.inf else "∞"  # all three digits
-        cells: tuple[Cell, ...] = (
-            Figure(short(pair.first), pair.first),
-            Figure(short(pair.second), pair.second),
-            pair.difference,
-            None if share is None else Figure(percentage(share), share),
-            None if np.isnan(factor) else Figure(f"{times} ×", factor),
-        )
-        honest = "" if measure.honest is None else f"{measure.honest:g}"
-        rows.append(Row(measure.title, honest, cells, level=LEVEL))
-    return rows
+        cells = [
+            _honest(measure),
+            *_numbers([pair.first, pair.second], short),
+            _average(pair.difference, LEVEL),
+            *_numbers([share], percentage),
+            None if np.isnan(factor) else Cell(f"{times} ×", [factor]),
+        ]
+        rows.append(Row(measure.label, cells, measure.unit))
+    corner = f"{comparison.runs:,} run{'s' * (comparison.runs != 1)} in pairs"
+    ends = "difference", "better in", "narrower by"
+    return Table([corner, "honest", comparison.first, comparison.second, *ends], rows, fixed=1)
 
 
 def notes_on_pairs(comparisons: Sequence[Comparison]) -> list[tuple[str, str]]:
-    """Notes on the columns of `rows_of_pairs`, and the doubts: terms, each with a sentence."""
+    """Notes on the columns of `table_of_pairs`, and the doubts: terms, each with a sentence."""
     shown: dict[str, PairedDifference] = {}
     doubts = []
     for comparison in comparisons:
