@@ -315,7 +315,7 @@ def run_from(pose, pose_cov=WORLD.pose_cov):
     (
         lambda: jaxslam.verify_jacobians(3),
         "^verify_jacobians: model: expected a Motion, a Sensor, a Factor, a BeamModel or a function of "
-        "vectors, got int",
+        "vectors, got 3",
     ),
     (lambda: jaxslam.verify_jacobians(np.sin, 3), "jacobian: expected a function, got 3"),
     (

@@ -48,6 +48,7 @@ INTRODUCED = {
     "jaxslam.results": "Reports, figures and files",
     "jaxslam.math": "Mathematics",
     "jaxslam.core.noise": "Noise models",
+    "jaxslam.core.claims": "What a model claims",
     "jaxslam.core.slots": "The table of landmarks",
     "jaxslam.core.validation": "Checks, and the errors of bad input",
 }

@@ -1,5 +1,5 @@
 """What models, filters and worlds are made of."""
 
-from jaxslam.core import logs, noise, protocols, record, slots, types, validation
+from jaxslam.core import claims, logs, noise, protocols, record, slots, types, validation
 
-__all__ = ["logs", "noise", "protocols", "record", "slots", "types", "validation"]
+__all__ = ["claims", "logs", "noise", "protocols", "record", "slots", "types", "validation"]

@@ -21,6 +21,7 @@ from jaxtyping import Bool, Float, Int, PyTree
 
 from jaxslam.core._names import unfit_signature
 from jaxslam.core._record import Function, check_field, field, is_record, record, static
+from jaxslam.core.claims import Argument, Claim, Gaussian, Points, ValuesOf
 from jaxslam.core.noise import Constant, NoiseCov
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate, Info, JaxOrNumPy, Log, Scan, Trace
@@ -87,6 +88,8 @@ class Component:
 
     name: str
     """lower case, for tables, files and messages; by default that of the class"""
+    kind: str = ""
+    """what `verify` calls it in a report"""
     __dataclass_fields__: ClassVar[dict[str, Any]]
 
     def __init_subclass__(cls) -> None:
@@ -97,6 +100,10 @@ class Component:
     def __init__(self, *_: object, **__: object) -> None:  # a record has a constructor of its own
         reason = "expected @record above the class, of jaxslam.core.record"
         raise InvalidField("", reason, owner=type(self).__name__)
+
+    def claims(self) -> tuple[Claim, ...]:
+        """What `verify` compares: its functions with their Jacobians; here nothing."""
+        return ()
 
     def _check(self, base: type, methods: Mapping[str, str]) -> None:
         """Check that a subclass of `base` defines methods of these parameters.
@@ -197,6 +204,7 @@ class Motion(Model):
     state without units, or a missing method.
     """
 
+    kind = "motion"
     state: tuple[str, ...] = POSE
     """What robot holds, with units: the pose, then E further numbers, as "v [m/s]" or a bias. Those
     in [rad] are angles, wrapped by `step`."""
@@ -219,6 +227,36 @@ class Motion(Model):
     def step(self, pose: Robot, u: Control, w: ProcessNoise) -> Robot:
         """The pose after a control, or the robot after it; θ wrapped."""
         raise NotImplementedError
+
+    def claims(self) -> tuple[Claim, ...]:
+        """The claim of `step`."""
+
+        def cov(pose: Robot, u: Control, w: ProcessNoise) -> Array:
+            noise_cov: Array = self.noise_cov(pose, u)
+            return noise_cov
+
+        def perturbed(pose: Robot, u: Control, w: ProcessNoise) -> Robot:
+            return self.step(pose, self.perturb(u, w), jnp.zeros_like(w))
+
+        arguments = (
+            Argument("pose", self.state),
+            Argument("control", self.controls, exact=True),
+            Argument("noise", self.noises, scale=0.1, cov=cov),
+        )
+        equation = "step(pose, u, w) = step(pose, perturb(u, w), 0)"
+        equal = {} if self.perturb is None else {equation: perturbed}
+        return (
+            Claim(
+                "step",
+                self.step,
+                arguments,
+                self.state,
+                self.jacobians,
+                equal,
+                wrapped=True,
+                everywhere=True,
+            ),
+        )
 
 
 class Free(NamedTuple):
@@ -255,6 +293,7 @@ class Sensor(Model):
     corrects the robot, whatever the tag.
     """
 
+    kind = "sensor"
     measurements: tuple[str, ...]
     """What z holds, with units; its length is Z."""
     support: Mapping[str, tuple[float, float]] = MappingProxyType({})
@@ -339,6 +378,37 @@ class Sensor(Model):
 
     def _mount(self, pose: Pose) -> Pose:
         return jnp.asarray(self.mount, pose.dtype)
+
+    def claims(self) -> tuple[Claim, ...]:
+        """The claims of `observe` and of its inverse, `invert`."""
+        pose = Argument("pose", (*POSE, *self.robot))
+        places = Points(self.embed, self.position, self.frame)
+        measured = ValuesOf("observe", self.support)
+        free = tuple(f"s[{k}]" for k in range(len(self.free.mean)))
+        return (
+            Claim(
+                "observe",
+                self.observe,
+                (pose, Argument("landmark", self.landmark, places)),
+                self.measurements,
+                self.observe_jacobians,
+                everywhere=True,
+                residual=self.residual,
+                noise_cov=lambda pose, landmark: self.noise_cov(self.observe(pose, landmark)),
+            ),
+            Claim(
+                "invert",
+                self.invert,
+                (
+                    pose,
+                    Argument("measurement", self.measurements, measured),
+                    Argument("free", free, Gaussian(*self.free)),
+                ),
+                self.landmark,
+                self.invert_jacobians,
+                everywhere=True,
+            ),
+        )
 
     def scans(self, scan: Scan) -> "list[tuple[Sensor | None, Scan]]":
         """The sensors of a suite in order, each with its scan; here this sensor with the scan.

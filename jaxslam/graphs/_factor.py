@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxslam.core._record import check_field, field, record, static
+from jaxslam.core.claims import Argument, Claim
 from jaxslam.core.protocols import POSE, Component, Motion, Sensor, motion_of_pose, sensor_of_robot
 from jaxslam.core.validation import InvalidField, instance_of
 from jaxslam.math import _linalg as linalg
@@ -79,6 +80,7 @@ class Factor(Component):
     other than a tuple of strings, and on an unknown kind of variable.
     """
 
+    kind = "factor"
     variables: tuple[str, ...]
     """the kind of each variable, "pose" or "point", in the order of `Table.who`; its length is K"""
     measurements: tuple[str, ...]
@@ -108,6 +110,26 @@ class Factor(Component):
     def residual(self, variables: tuple[Array, ...], z: Array) -> Array:
         """The error e (R,) of one row, angles wrapped: each pose (3,), each point (L,)."""
         raise NotImplementedError
+
+    def claims(self) -> tuple[Claim, ...]:
+        """The claim of `residual`, by its variables and its measurement; a point is (x, y)."""
+        arguments = [
+            Argument(
+                kind if self.variables.count(kind) == 1 else f"{kind} {k + 1}",
+                POSE if kind == "pose" else POSE[:2],
+            )
+            for k, kind in enumerate(self.variables)
+        ]
+
+        def residual(*values: Array) -> Array:
+            return self.residual(values[:-1], values[-1])
+
+        def jacobian(*values: Array) -> tuple[Array | None, ...]:
+            return (*self.jacobians(values[:-1], values[-1]), None)
+
+        measured = Argument("measurement", self.measurements)
+        claim = None if self.jacobians is None else jacobian
+        return (Claim("residual", residual, (*arguments, measured), self.errors, claim),)
 
 
 def _between(a: Array, b: Array) -> Array:

@@ -2,10 +2,10 @@
 
 from typing import NamedTuple, TypeAlias
 
-import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jaxslam.verify._differences import Quotient
 from jaxslam.verify._findings import Finding, WorstState, WrongEntry
 from jaxslam.verify._inputs.samples import LARGE, NOMINAL, Samples
 from jaxslam.verify._jacobians import Evaluated, Jacobians
@@ -32,15 +32,18 @@ def compare_methods(
     if evaluated.values is None:
         return []
     rows = np.flatnonzero(np.all(np.isfinite(evaluated.values), axis=1))
+
+    def kept(methods: dict[str, Values]) -> dict[str, Values]:
+        return {how: jacobian[rows] for how, jacobian in methods.items()}
+
     by_argument = tuple(
         Jacobians(
-            {how: jacobian[rows] for how, jacobian in evaluation.methods.items()},
-            {how: jacobian[rows] for how, jacobian in evaluation.single.items()},
-            evaluation.single_error[rows] if evaluation.single_error.ndim else np.zeros(()),
-            jax.tree.map(lambda part: part[rows], evaluation.quotient),
-            evaluation.how,
+            kept(e.methods),
+            kept(e.single),
+            e.single_error[rows] if e.single_error.ndim else e.single_error,
+            Quotient(*(part[rows] for part in e.quotient)),
         )
-        for evaluation in evaluated.by_argument
+        for e in evaluated.by_argument
     )
     values, labels = evaluated.samples
     samples = Samples(tuple(value[rows] for value in values), tuple(labels[i] for i in rows))
@@ -48,8 +51,8 @@ def compare_methods(
     return [
         _finding(evaluated, k, tolerance, float32_tolerance)
         for k, evaluation in enumerate(evaluated.by_argument)
-        if evaluated.function.outputs and evaluated.function.arguments[k].entries
-        if evaluation.methods and len(evaluation.methods) + (evaluation.quotient is not None) > 1
+        if evaluated.claim.outputs and evaluated.claim.arguments[k].entries
+        if evaluation.methods
     ]
 
 
@@ -77,32 +80,29 @@ class _Compared(NamedTuple):
 def _compare(evaluation: Jacobians, tolerance: float, float32_tolerance: float) -> _Compared:
     """The differences between the methods, relative to their tolerances."""
     gap, scale = _largest_gap(evaluation.methods)
-    gap32, scale32 = _largest_gap(evaluation.single)
-    away, error, lost, nothing_compared = np.zeros_like(gap), np.zeros_like(gap), 0, False
-    if evaluation.quotient is not None:
-        value, error, kink = evaluation.quotient
-        away = np.abs(np.stack(list(evaluation.methods.values())) - value).max(axis=0)
-        magnitude = np.abs(value).max(axis=2, keepdims=True, initial=0.0)
-        trusted = ((error <= _CONVERGED * magnitude) | (error <= _NOTHING)) & ~kink
-        away = np.where(trusted, np.where(np.isfinite(away), away, np.inf), 0.0)
-        # At a kink any value between the one-sided derivatives is accepted. Elsewhere, if the
-        # quotients do not converge, the result of autodiff may depend on rounding; where its two
-        # modes differ, the entries are not compared.
-        odd = ~trusted.all(axis=(1, 2), keepdims=True)
-        lost = int(odd.sum())
-        for g, methods, size, limit in (
-            (gap, evaluation.methods, scale, tolerance),
-            (gap32, evaluation.single, scale32, float32_tolerance),
-        ):
-            if g.size:
-                g[kink | (odd & _modes_differ(methods, size, limit))] = 0.0
-        nothing_compared = bool(gap.size) and lost == len(gap)  # so nothing passes
+    # Without float32 float64 takes its place, which is held to a smaller tolerance anyway.
+    single = evaluation.single or evaluation.methods
+    gap32, scale32 = _largest_gap(single)
+    value, error, kink = evaluation.quotient
+    away = np.abs(np.stack(list(evaluation.methods.values())) - value).max(axis=0)
+    magnitude = np.abs(value).max(axis=2, keepdims=True, initial=0.0)
+    trusted = ((error <= _CONVERGED * magnitude) | (error <= _NOTHING)) & ~kink
+    away = np.where(trusted, np.where(np.isfinite(away), away, np.inf), 0.0)
+    # At a kink any value between the one-sided derivatives is accepted. Elsewhere, if the quotients
+    # do not converge, the result of autodiff may depend on rounding; where its two modes differ,
+    # the entries are not compared.
+    odd = ~trusted.all(axis=(1, 2), keepdims=True)
+    lost = int(odd.sum())
+    for g, methods, size, limit in (
+        (gap, evaluation.methods, scale, tolerance),
+        (gap32, single, scale32, float32_tolerance),
+    ):
+        g[kink | (odd & _modes_differ(methods, size, limit))] = 0.0
+    nothing_compared = bool(gap.size) and lost == len(gap)  # so nothing passes
     # Cancellation rounds by more than the size suggests: in float64 by 2⁻²⁹ of float32's error, and
     # in float32 the hand-derived Jacobian need not be more accurate than autodiff.
     relative = _beyond(gap, 2.0**-28 * evaluation.single_error, scale, tolerance)
-    relative32 = np.zeros_like(gap)
-    if gap32.size:
-        relative32 = _beyond(gap32, 2 * evaluation.single_error, scale32, float32_tolerance)
+    relative32 = _beyond(gap32, 2 * evaluation.single_error, scale32, float32_tolerance)
     from_quotient = _beyond(away, 10 * error, scale, _DIFFERENCES_TOLERANCE)
     in_double = np.maximum(relative / tolerance, from_quotient / _DIFFERENCES_TOLERANCE)
     in_double = np.where(nothing_compared, np.inf, in_double)
@@ -128,8 +128,8 @@ def _beyond(gap: Values, rounding: np.ndarray, scale: np.ndarray, tolerance: flo
 
 
 def _finding(evaluated: Evaluated, k: int, tolerance: float, float32_tolerance: float) -> Finding:
-    function, samples = evaluated.function, evaluated.samples
-    evaluation, argument = evaluated.by_argument[k], function.arguments[k]
+    claim, samples = evaluated.claim, evaluated.samples
+    evaluation, argument = evaluated.by_argument[k], claim.arguments[k]
     compared = _compare(evaluation, tolerance, float32_tolerance)
     wrong = compared.excess > 1
     often = wrong.sum(axis=0)
@@ -141,12 +141,11 @@ def _finding(evaluated: Evaluated, k: int, tolerance: float, float32_tolerance: 
         values = {how: float(m[s, i, j]) for how, m in shown.items()}
         size = float(compared.scale[s, i, 0])
         room = (float32_tolerance if in_single else tolerance) * size
-        near = room
-        if evaluation.quotient is not None:
-            values["differences"] = float(evaluation.quotient.value[s, i, j])
-            near += _DIFFERENCES_TOLERANCE * size + 10 * float(evaluation.quotient.error[s, i, j])
+        values["differences"] = float(evaluation.quotient.value[s, i, j])
+        error = float(evaluation.quotient.error[s, i, j])
+        near = room + _DIFFERENCES_TOLERANCE * size + 10 * error
         return WrongEntry(
-            row=function.outputs[i],
+            row=claim.outputs[i],
             column=argument.entries[j],
             states=int(often[i, j]),
             precision="float32" if in_single else "float64",
@@ -165,22 +164,20 @@ def _finding(evaluated: Evaluated, k: int, tolerance: float, float32_tolerance: 
         excess = np.where(usual if usual.any() else wrong[:, i, j], compared.excess[:, i, j], -1)
         entries.append(entry(int(np.argmax(excess)), int(i), int(j)))
     entries.sort(key=lambda e: -e.states)
-    has_quotient = evaluation.quotient is not None
     # Without a finite derivative by any method, their differences mean nothing.
     lost = bool(wrong[~np.isfinite(list(evaluation.methods.values())).any(axis=0)].any())
     return Finding(
-        function=function.name,
+        function=claim.name,
         argument=argument.name,
         passed=not entries and len(samples.labels) > 0,
-        methods=(*evaluation.methods, *(("differences",) if has_quotient else ())),
+        methods=(*evaluation.methods, "differences"),
         absolute=np.inf if lost else float(compared.gap.max(initial=0.0)),
         relative=np.inf if lost else float(compared.relative.max(initial=0.0)),
         tolerance=tolerance,
         float32=float(compared.relative32.max(initial=0.0)) if evaluation.single else None,
         float32_tolerance=float32_tolerance,
-        differences=float(compared.from_quotient.max(initial=0.0)) if has_quotient else None,
+        differences=float(compared.from_quotient.max(initial=0.0)),
         differences_tolerance=_DIFFERENCES_TOLERANCE,
-        quotient=evaluation.how,
         samples=len(samples.labels),
         no_derivative=compared.no_derivative,
         worst_state=_worst_state(compared, evaluated, k),
@@ -193,8 +190,8 @@ def _worst_state(compared: _Compared, evaluated: Evaluated, k: int) -> WorstStat
     if not compared.excess.size:
         return {}
     s, i, j = (int(k) for k in np.unravel_index(np.argmax(compared.excess), compared.excess.shape))
-    function = evaluated.function
-    entry = (function.outputs[i], function.arguments[k].entries[j])
+    claim = evaluated.claim
+    entry = (claim.outputs[i], claim.arguments[k].entries[j])
     return {
         "label": evaluated.samples.labels[s],
         "entry": entry,
@@ -204,7 +201,7 @@ def _worst_state(compared: _Compared, evaluated: Evaluated, k: int) -> WorstStat
 
 def _state(evaluated: Evaluated, s: int) -> dict[str, list[float]]:
     """The arguments at a state by name."""
-    pairs = zip(evaluated.function.arguments, evaluated.samples.values, strict=True)
+    pairs = zip(evaluated.claim.arguments, evaluated.samples.values, strict=True)
     return {argument.name: [float(v) for v in table[s]] for argument, table in pairs}
 
 
@@ -216,8 +213,6 @@ def _largest_gap(
     The size is the row's largest entry, since rows have different units, but at least a
     thousandth of its median over the states.
     """
-    if not methods:
-        return np.zeros((0, 0, 0)), np.zeros((0, 0, 0))
     stack = np.stack(list(methods.values()))
     with np.errstate(invalid="ignore"):
         gap = stack.max(axis=0) - stack.min(axis=0)

@@ -111,18 +111,3 @@ def modulo_periods(
     return np.where(
         np.isfinite(periods), difference - turns * np.round(difference / turns), difference
     )
-
-
-def complex_step(
-    function: Batch, arguments: tuple[Values, ...], k: int, step: float = 1e-30
-) -> Float[np.ndarray, "S m n"]:
-    """The derivative ∂f/∂argument as Im f(x + ih)/h, without cancellation (Squire & Trapp 1998).
-
-    Right only for a function that is analytic and takes complex numbers.
-    """
-    x = arguments[k]
-    count, n = x.shape
-    flat = [np.repeat(a, n, axis=0).astype(np.complex128) for a in arguments]
-    flat[k] = (x[:, None] + 1j * step * np.eye(n)).reshape(-1, n)
-    values = np.asarray(function(*flat)).reshape(count, n, -1)
-    return np.swapaxes(values.imag / step, 1, 2)

@@ -81,12 +81,10 @@ class Finding:
     float32: float | None
     """largest relative difference in float32; None where it was not computed"""
     float32_tolerance: float
-    differences: float | None
+    differences: float
     """largest relative difference from the quotients, where they converge; their estimated error
     counts as rounding"""
     differences_tolerance: float
-    quotient: str
-    """the kind of quotient: differences or complex step"""
     samples: int
     no_derivative: int
     """number of samples at which the quotients do not converge and are ignored"""
@@ -111,13 +109,12 @@ class Finding:
         worst = f"worst {_two_digits(self.absolute)} abs, {_two_digits(self.relative)} rel"
         if self.float32 is not None:
             worst += f", float32 {_two_digits(self.float32)}"
-        if self.differences is not None:
-            worst += f", {self.quotient} {_two_digits(self.differences)}"
+        worst += f", differences {_two_digits(self.differences)}"
         if not (self.samples and math.isfinite(self.absolute)):
             worst = "a derivative is not finite" if self.samples else "no value is finite"
         claim = "hand-derived" if self.claimed else "no hand-derived claim"
         if not {"jacfwd", "jacrev"} & {*self.methods}:
-            claim += f", compared with {self.quotient} alone"
+            claim += ", compared with differences alone"
         yield f"{verdict}  {self.name} ({claim}): {worst}; {self.samples} states{odd}"
         for entry in self.wrong_entries[:_SHOWN]:
             yield from (f"      {line}" for line in entry.lines(self.samples))

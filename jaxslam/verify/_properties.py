@@ -1,6 +1,6 @@
-"""Checks other than Jacobians: round trips, residuals, noise, purity, finite values, dtypes."""
+"""Checks other than Jacobians: inverses, residuals, noise, purity, finite values, dtypes."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import TypeAlias
 
 import jax
@@ -9,14 +9,14 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from jaxslam.core.protocols import Motion, Sensor
+from jaxslam.core.claims import Claim, Gaussian, Points, ValuesOf
 from jaxslam.core.validation import InvalidField, covariance, require
 from jaxslam.math._xla import quick_jit
 from jaxslam.verify._differences import modulo_periods
 from jaxslam.verify._findings import Check
 from jaxslam.verify._finite import finite_check
-from jaxslam.verify._inputs.functions import Function, at_state, periods, sensor_functions
-from jaxslam.verify._inputs.samples import NOMINAL, Samples
+from jaxslam.verify._inputs.functions import at_state, periods
+from jaxslam.verify._inputs.samples import NOMINAL
 from jaxslam.verify._jacobians import Evaluated
 from jaxslam.verify._loops import limit_loops
 from jaxslam.verify._user_errors import describe_error
@@ -29,147 +29,146 @@ _GAUSS_NEWTON = 12
 """number of Gauss-Newton iterations for the free coordinates of a landmark"""
 
 
-def function_checks(evaluated: Evaluated) -> Iterator[Check]:
-    """Checks of any function: finite values and derivatives, purity, and jit and vmap agree."""
-    if evaluated.values is None:
-        return
-    function = evaluated.function
-    yield finite_check(evaluated)
-    if any(evaluation.methods for evaluation in evaluated.by_argument):
-        yield from _guard(f"{function.name} is pure", lambda: _pure(function, evaluated))
+def all_checks(evaluated: Sequence[Evaluated], *, of_model: bool) -> Iterator[Check]:
+    """The checks of claims: where they have values these and the derivatives are finite, the
+    functions pure, the same under jit and vmap; those of a model keep the dtype of their arguments;
+    and what else they claim."""
+    for e in evaluated:
+        yield from e.checks
+        if e.values is None:
+            continue
+        yield finite_check(e)
+        if any(jacobians.methods for jacobians in e.by_argument):
+            yield _guarded(f"{e.claim.name} is pure", _pure, e)
+            if of_model:
+                yield _guarded(f"{e.claim.name} keeps the dtype", _dtypes, e)
+    if all(e.values is not None for e in evaluated):  # else they fail for the same reason
+        for e in evaluated:
+            yield from claim_checks(e, evaluated)
 
 
-def dtype_checks(evaluated: Evaluated) -> Iterator[Check]:
-    """The check of a model's function that its result has the dtype of its arguments."""
-    if any(evaluation.methods for evaluation in evaluated.by_argument):
-        function = evaluated.function
-        yield from _guard(
-            f"{function.name} keeps the dtype", lambda: _dtypes(function, evaluated.samples)
-        )
+def claim_checks(evaluated: Evaluated, before: Sequence[Evaluated] = ()) -> Iterator[Check]:
+    """Checks of what a claim says besides its Jacobian; before: with the claims before it."""
+    claim, states, values = evaluated.claim, evaluated.samples.values, evaluated.values
+    assert values is not None
+    noises = [(a.cov, len(a.entries)) for a in claim.arguments]
+    for cov, size in [*noises, (claim.noise_cov, len(claim.outputs))]:
+        if cov is not None:
+            yield _guarded("noise covariance", _covariances, cov, states, size)
+    if claim.wrapped:
+        yield _guarded("the heading is wrapped to (-π, π]", _heading_error, claim, values)
+    for equation, function in claim.equal.items():
+        yield _guarded(equation, _equality_error, function, evaluated)
+    if claim.residual is not None:
+        yield from _residual_checks(claim.residual, values, periods(claim.outputs))
+        yield _guarded("angles have [rad] in their names", _unnamed_angle, evaluated)
+    for argument in claim.arguments:
+        if isinstance(argument.domain, ValuesOf) and claim.outputs:
+            (seen,) = (e for e in before if e.claim.name == argument.domain.claim)
+            forth, back = seen.claim.name, claim.name
+            yield _guarded(
+                f"{forth} undoes {back}, whatever is free", _image_error, seen, evaluated
+            )
+            yield _guarded(
+                f"{back} undoes {forth}, within what is free", _inversion_error, seen, claim
+            )
 
 
-def motion_checks(motion: Motion, samples: Samples) -> Iterator[Check]:
-    """Checks of a motion model: its noise, its heading, and `perturb`."""
-    pose, u, w = samples.values
-    yield from _guard(
-        "noise covariance", lambda: _covariances(motion.noise_cov, (pose, u), w.shape[-1])
-    )
-
-    def heading_error() -> str:
-        heading = np.asarray(quick_jit(jax.vmap(motion.step))(pose, u, w))[:, 2]
-        worst = float(np.max(np.abs(heading)))
-        return "" if worst <= np.pi else f"it returns a heading of {worst:.6g} rad"
-
-    yield from _guard("the heading is wrapped to (-π, π]", heading_error)
-    perturb = motion.perturb
-    if perturb is None:
-        return
-
-    def perturb_error() -> str:
-        def gap(pose: jax.Array, u: jax.Array, w: jax.Array) -> jax.Array:
-            perturbed = motion.step(pose, perturb(u, w), jnp.zeros_like(w))
-            return perturbed - motion.step(pose, u, w)
-
-        return _deviation(quick_jit(jax.vmap(gap))(pose, u, w), periods(motion.state))
-
-    yield from _guard("step(pose, u, w) = step(pose, perturb(u, w), 0)", perturb_error)
+def _heading_error(claim: Claim, values: Values) -> str:
+    """An angle beyond half a turn, or ""."""
+    angles = values[:, np.isfinite(periods(claim.outputs))]
+    heading = np.abs(angles).max(initial=0.0)
+    return "" if heading <= np.pi else f"it returns a heading of {heading:.6g} rad"
 
 
-def sensor_checks(sensor: Sensor, seen: Samples, inverse: Samples) -> Iterator[Check]:
-    """Checks of a sensor: noise, residual, and that `invert` is the inverse of `observe`."""
-    circle = periods(sensor.measurements)
-    z = np.asarray(quick_jit(jax.vmap(sensor.observe))(*seen.values), np.float64)
-    yield from _guard("noise covariance", lambda: _covariances(sensor.noise_cov, (z,), z.shape[-1]))
-    residual = quick_jit(jax.vmap(sensor.residual))
+def _equality_error(function: Callable[..., jax.Array], evaluated: Evaluated) -> str:
+    """The difference of another function from a claim's, or ""."""
+    values = np.asarray(_batch(function)(*evaluated.samples.values))
+    return _deviation(values - evaluated.values, periods(evaluated.claim.outputs))
 
-    def residual_size() -> str:
+
+def _residual_checks(
+    function: Callable[[jax.Array, jax.Array], jax.Array], z: Values, circle: Values
+) -> Iterator[Check]:
+    """Checks of a residual at values z, whose periods are in circle."""
+    residual = _batch(function)
+
+    def size_error() -> str:
         got = jax.eval_shape(residual, z, z).shape[1:]
         return "" if got == z.shape[1:] else f"it returns shape {got}, expected {z.shape[1:]}"
 
-    size = list(_guard("the residual has the size of z", residual_size))
-    if not all(check.passed for check in size):
-        yield from size
+    size = _guarded("the residual has the size of z", size_error)
+    if not size.passed:
+        yield size
         return
     z_hat = z[::-1] + np.random.default_rng(0).uniform(-1, 1, z.shape)
-    yield from _guard(
-        "the residual is zero at equality",
-        lambda: _exactly(residual(z, z)),
-    )
-    yield from _guard(
+    yield _guarded("the residual is zero at equality", lambda: _exactly(residual(z, z)))
+    yield _guarded(
         "the residual is antisymmetric",
         lambda: _deviation(residual(z, z_hat) + residual(z_hat, z), circle),
     )
     wrapped = ", wrapped on the circle" if np.isfinite(circle).any() else ""
-    yield from _guard(
+    yield _guarded(
         f"the residual is a difference{wrapped}",
         lambda: _residual_error(residual, z, z_hat, circle),
     )
-    yield from _guard("angles have [rad] in their names", lambda: _unnamed_angle(sensor, seen))
-    if not sensor.landmark:
-        return
-
-    def observation_error() -> str:
-        def again(pose: jax.Array, z: jax.Array, s: jax.Array) -> jax.Array:
-            return sensor.residual(sensor.observe(pose, sensor.invert(pose, z, s)), z)
-
-        # At range zero the bearing is lost.
-        regular = np.array(["zero" not in label and "= 0" not in label for label in inverse.labels])
-        if len(sensor.measurements) + len(sensor.free.mean) > len(sensor.landmark):
-            # z tells more than a landmark, as a range rate; at the random states it was observed.
-            regular = np.array([label in NOMINAL for label in inverse.labels])
-        few = tuple(a[regular] for a in inverse.values)
-        size = 1 + np.abs(few[0]).max()
-        off = np.asarray(quick_jit(jax.vmap(again))(*few)) / size
-        if not (trouble := _exactly(off)):
-            return ""
-        row, entry = np.unravel_index(
-            np.argmax(np.where(np.isnan(off), np.inf, abs(off))), off.shape
-        )
-        at = at_state(sensor_functions(sensor)[1], [a[row] for a in few])
-        away = abs(off[row, entry]) * size
-        if abs(away - 2 * np.pi) < 1e-6:
-            trouble = "off by 2π (an angle's name ends in [rad])"
-        return f"{sensor.measurements[entry]} is {trouble}, at {at}"
-
-    yield from _guard("observe undoes invert, whatever is free", observation_error)
-    yield from _guard(
-        "invert undoes observe, within what is free", lambda: _inversion_error(sensor, seen)
-    )
 
 
-def _unnamed_angle(sensor: Sensor, seen: Samples) -> str:
-    """An entry of z that jumps by 2π as the robot turns, and is not [rad] by its name, or ""."""
-    pose, *landmark = (values[0] for values in seen.values)
-    turns = np.linspace(0, 2 * np.pi, 65)
-    poses = np.tile(pose, (65, 1))
-    poses[:, 2] = turns
-    z = quick_jit(jax.vmap(sensor.observe, in_axes=(0, *(None for _ in landmark))))
-    steps = np.abs(np.diff(np.asarray(z(poses, *landmark), np.float64), axis=0))
+def _unnamed_angle(evaluated: Evaluated) -> str:
+    """An entry that jumps by 2π as the robot turns, and is not [rad] by its name, or ""."""
+    claim = evaluated.claim
+    pose, *fixed = (np.tile(table[0], (65, 1)) for table in evaluated.samples.values)
+    pose[:, 2] = np.linspace(0, 2 * np.pi, 65)
+    z = np.asarray(_batch(claim.function)(pose, *fixed), np.float64)
+    steps = np.abs(np.diff(z, axis=0))
     jumps = np.any(np.abs(steps - 2 * np.pi) < 0.5, axis=0) & (np.median(steps, axis=0) < 0.5)
-    jumps &= ~np.isfinite(periods(sensor.measurements))
-    for name in np.array(sensor.measurements)[jumps]:
+    jumps &= ~np.isfinite(periods(claim.outputs))
+    for name in np.array(claim.outputs)[jumps]:
         return f"{name} jumps by 2π as the robot turns: name it '{name.split(' [')[0]} [rad]'"
     return ""
 
 
-def _inversion_error(sensor: Sensor, seen: Samples) -> str:
+def _image_error(seen: Evaluated, inverse: Evaluated) -> str:
+    """The error of observe(pose, invert(pose, z, s)) = z, or ""."""
+    observe, invert, labels = seen.claim, inverse.claim, inverse.samples.labels
+
+    def again(pose: jax.Array, z: jax.Array, s: jax.Array) -> jax.Array:
+        return observe.function(pose, invert.function(pose, z, s)) - z
+
+    # At range zero the bearing is lost.
+    regular = np.array(["zero" not in label and "= 0" not in label for label in labels])
+    if sum(len(argument.entries) for argument in invert.arguments[1:]) > len(invert.outputs):
+        # z tells more than a landmark, as a range rate; at the random states it was observed.
+        regular = np.array([label in NOMINAL for label in labels])
+    few = tuple(table[regular] for table in inverse.samples.values)
+    size = 1 + np.abs(few[0]).max()
+    off = modulo_periods(np.asarray(_batch(again)(*few)), periods(observe.outputs)) / size
+    if not (trouble := _exactly(off)):
+        return ""
+    row, entry = np.unravel_index(np.argmax(np.where(np.isnan(off), np.inf, abs(off))), off.shape)
+    if abs(abs(off[row, entry]) * size - 2 * np.pi) < 1e-6:
+        trouble = "off by 2π (an angle's name ends in [rad])"
+    at = at_state(invert, [table[row] for table in few])
+    return f"{observe.outputs[entry]} is {trouble}, at {at}"
+
+
+def _inversion_error(seen: Evaluated, invert: Claim) -> str:
     """The error of invert(pose, observe(pose, l), s) = l for the best s, or ""."""
-    usual = [i for i, label in enumerate(seen.labels) if label in NOMINAL]
-    pose = seen.values[0][usual]
-    point = pose[:, :2] + np.roll(pose[:, :2], 1, axis=0) / 2 + 1
-    if "given" in seen.labels and sensor.of_points:
-        point = seen.values[1]
-    mean = np.asarray(sensor.free.mean, np.float64)
-    spread = np.sqrt(np.diagonal(np.asarray(sensor.free.cov, np.float64)))
-    circular = np.isfinite(circle := periods(sensor.landmark))
+    observe = seen.claim
+    (points,) = (a.domain for a in observe.arguments if isinstance(a.domain, Points))
+    (free,) = (a.domain for a in invert.arguments if isinstance(a.domain, Gaussian))
+    usual = [i for i, label in enumerate(seen.samples.labels) if label in NOMINAL]
+    pose, landmark = (table[usual] for table in seen.samples.values)
+    mean, spread = np.asarray(free.mean), np.sqrt(np.diagonal(np.asarray(free.cov)))
+    circular = np.isfinite(circle := periods(invert.outputs))
     period = np.where(circular, circle, 1.0)
 
-    def gap(pose: jax.Array, point: jax.Array) -> jax.Array:
-        landmark = sensor.embed(pose[:3], point)
-        z = sensor.observe(pose, landmark)
+    def gap(pose: jax.Array, landmark: jax.Array) -> jax.Array:
+        landmark = points.embed(pose[:3], points.position(landmark))
+        z = observe.function(pose, landmark)
 
         def miss(s: jax.Array) -> jax.Array:
-            difference = sensor.invert(pose, z, s) - landmark
+            difference = invert.function(pose, z, s) - landmark
             turns = jnp.round(difference / period)
             return difference - jnp.where(circular, turns * period, 0.0)
 
@@ -186,12 +185,12 @@ def _inversion_error(sensor: Sensor, seen: Samples) -> str:
         gaps = jax.vmap(from_start)(jnp.asarray(mean, pose.dtype)[None] + offsets)
         return jnp.where(jnp.isfinite(gaps), gaps, jnp.inf).min()
 
-    gaps = np.asarray(quick_jit(jax.vmap(gap))(pose, point))
+    gaps = np.asarray(_batch(gap)(pose, landmark))
     worst = int(np.argmax(gaps))
     if gaps[worst] <= _ROUNDING * (1 + np.abs(pose).max()):
         return ""
     return (
-        f"a landmark at ({point[worst][0]:.4g}, {point[worst][1]:.4g}) observed from "
+        f"the landmark ({', '.join(f'{v:.4g}' for v in landmark[worst])}) observed from "
         f"({', '.join(f'{v:.4g}' for v in pose[worst])}) is returned with an error of "
         f"{gaps[worst]:.3g}"
     )
@@ -218,11 +217,9 @@ def _residual_error(
     return ""
 
 
-def _covariances(
-    noise_cov: Callable[..., jax.Array], arguments: tuple[Values, ...], size: int
-) -> str:
-    """The fault of the noise covariances of `size` numbers at some arguments, or ""."""
-    covs = np.asarray(quick_jit(jax.vmap(limit_loops(noise_cov)))(*arguments))
+def _covariances(noise_cov: Callable[..., jax.Array], states: Sequence[Values], size: int) -> str:
+    """The fault of the noise covariances of `size` numbers at some states, or ""."""
+    covs = np.asarray(_batch(noise_cov)(*states))
     if covs.shape[1:] != (size, size):
         return f"noise_cov returns shape {covs.shape[1:]}, expected ({size}, {size})"
     for cov in covs:
@@ -245,11 +242,12 @@ def _exactly(difference: ArrayLike) -> str:
     return _deviation(difference, np.full(np.shape(difference)[-1], np.inf))
 
 
-def _pure(function: Function, evaluated: Evaluated) -> str:
+def _pure(evaluated: Evaluated) -> str:
     """Whether the function agrees with itself when called twice, and under jit and vmap; or ""."""
-    assert evaluated.values is not None
-    finite = np.flatnonzero(np.isfinite(evaluated.values).all(axis=1))
-    call = limit_loops(function.call) if evaluated.loops else function.call
+    claim, values = evaluated.claim, evaluated.values
+    assert values is not None
+    finite = np.flatnonzero(np.isfinite(values).all(axis=1))
+    call = limit_loops(claim.function) if evaluated.loops else claim.function
     for i in finite[[0, -1]] if len(finite) else ():
         state = tuple(jnp.asarray(a[i]) for a in evaluated.samples.values)
         first, second = (np.asarray(call(*state), np.float64) for _ in range(2))
@@ -258,26 +256,31 @@ def _pure(function: Function, evaluated: Evaluated) -> str:
                 "two calls with the same arguments differ: it keeps a state or draws random numbers"
             )
         scale = 1.0 + max(float(np.max(np.abs(np.asarray(a)), initial=0)) for a in (*state, first))
-        off = first - evaluated.values[i]
-        if bad := _deviation(off / scale, periods(function.outputs) / scale):
+        off = first - values[i]
+        if bad := _deviation(off / scale, periods(claim.outputs) / scale):
             return f"under jit and vmap the value differs, {bad}"
     return ""
 
 
-def _dtypes(function: Function, samples: Samples) -> str:
+def _dtypes(evaluated: Evaluated) -> str:
     """The dtype that is not kept, or ""."""
     for dtype in (np.float32, np.float64):
-        shapes = (jax.ShapeDtypeStruct(a.shape[1:], dtype) for a in samples.values)
-        result = jax.eval_shape(function.call, *shapes)
+        shapes = (jax.ShapeDtypeStruct(a.shape[1:], dtype) for a in evaluated.samples.values)
+        result = jax.eval_shape(evaluated.claim.function, *shapes)
         if result.dtype != dtype:
             return f"{np.dtype(dtype).name} in, {result.dtype} out"
     return ""
 
 
-def _guard(name: str, run: Callable[[], str]) -> Iterator[Check]:
-    """A check by name, passed if run returns ""; else it reports the result or the exception."""
+def _batch(function: Callable[..., jax.Array]) -> Callable[..., jax.Array]:
+    """The function over states, its loops limited."""
+    return quick_jit(jax.vmap(limit_loops(function)))
+
+
+def _guarded(name: str, run: Callable[..., str], *arguments: object) -> Check:
+    """A check by name, passed if run(*arguments) returns ""; it reports the result or the error."""
     try:
-        trouble = run()
+        trouble = run(*arguments)
     except (Exception, SystemExit) as error:
         trouble = describe_error(error)
-    yield Check(name, not trouble, trouble)
+    return Check(name, not trouble, trouble)

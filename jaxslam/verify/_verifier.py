@@ -1,42 +1,44 @@
-"""The function `verify_jacobians`: samples, Jacobians, other checks, and the report."""
+"""The function `verify_jacobians`: claims, their Jacobians, other checks, and the report."""
 
 import inspect
 from collections.abc import Callable, Mapping, Sequence
+from typing import TypeVar
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxslam.core._reprs import describe
-from jaxslam.core.protocols import Motion, Sensor
+from jaxslam.core.claims import Claim, Jacobian
+from jaxslam.core.protocols import Component
 from jaxslam.core.validation import InvalidField, at_least, positive, refusals_of, require
-from jaxslam.graphs import Factor
-from jaxslam.laser.grids.beam_models import BeamModel
 from jaxslam.math._arrays import float64
+from jaxslam.math._xla import quick_jit
 from jaxslam.verify._comparison import compare_methods
-from jaxslam.verify._examination import Model, examine, functions_of
-from jaxslam.verify._findings import Report
-from jaxslam.verify._inputs.beams import FAR, beam_function, beam_samples
-from jaxslam.verify._inputs.functions import (
-    NAMED,
-    Claim,
-    Function,
-    factor_function,
-    makes_a_model,
-    plain_function,
-    with_signature_errors,
-)
-from jaxslam.verify._inputs.samples import Samples
+from jaxslam.verify._findings import Finding, Report
+from jaxslam.verify._finite import singular_notes
+from jaxslam.verify._inputs.functions import NAMED, function_claim, periods
+from jaxslam.verify._inputs.samples import NOMINAL, Samples, Seen, claim_samples
+from jaxslam.verify._jacobians import Evaluated, evaluate_jacobians
+from jaxslam.verify._loops import limit_loops
+from jaxslam.verify._properties import all_checks
+from jaxslam.verify.linearity import linearity_index
 
 _MOUNT = (0.4, -0.3, 0.9)
 """The mount of a sensor made by `build`: off the robot's centre, so that all terms contribute."""
+_MAX_RANGE = 40.0
+"""The maximum range [m] of a beam model made by `build`: beyond the walls around it."""
 
 TOLERANCE = 1e-12
 FLOAT32_TOLERANCE = 1e-5
 
+_M = TypeVar("_M", bound=Component)
+
 
 def verify_jacobians(
-    model: Model,
-    jacobian: Claim | None = None,
+    model: Component | Callable[..., jax.Array],
+    jacobian: Jacobian | None = None,
     *,
     arguments: Mapping[str, Sequence[str] | int] | None = None,
     outputs: Sequence[str] | None = None,
@@ -50,10 +52,10 @@ def verify_jacobians(
     """Compare the Jacobians of a model by every argument, computed by four methods.
 
     At each sampled state these are `jax.jacfwd`, `jax.jacrev`, the hand-derived Jacobian if there
-    is one, and difference quotients in float64 (Ridders' extrapolation with its error estimate; the
-    complex step where the function is analytic). The states are random ones and difficult ones,
-    which follow from the units of the arguments: headings next to ±π, a landmark close to and at
-    the robot and the sensor, zero rate, zero inverse depth, coordinates of 1e5 m, zero control.
+    is one, and difference quotients in float64 (Ridders' extrapolation with its error estimate).
+    The states are random ones and difficult ones, which follow from the units of the arguments:
+    headings next to ±π, a landmark close to and at the robot and the sensor, zero rate, zero
+    inverse depth, coordinates of 1e5 m, zero control.
     Differences are relative to the largest entry of the Jacobian's row; angles are compared modulo
     2π. Autodiff and the hand-derived Jacobian are compared in float32, too. A mode of
     differentiation that the function has not (jacrev of a `while` loop, jacfwd of a
@@ -71,9 +73,8 @@ def verify_jacobians(
     reported with the line in its file, and the remaining checks are run.
 
     Args:
-        model: a `Motion`, a `Sensor`, a `graphs.Factor`, a `grids.BeamModel` (its log-densities, by
-            the pose and the ranges, in a map without rounding: `inputs.beam_models`), or a pure
-            function of vectors.
+        model: a `Motion`, a `Sensor`, a `graphs.Factor`, a `grids.BeamModel`, or another model with
+            `claims`; or a pure function of vectors.
         jacobian: of a function, its hand-derived Jacobian. Called with the function's arguments it
             returns a tuple of one (m, n_k) array an argument (None: no claim), or one array: by the
             first argument, or by all of them side by side. Models have their claims.
@@ -99,110 +100,130 @@ def verify_jacobians(
         require("count", count, at_least(2))
         if not 0 <= seed < 2**32:
             raise InvalidField("seed", f"expected a number between 0 and 2³²-1, got {seed}")
-        if not (isinstance(model, Motion | Sensor | Factor | BeamModel) or callable(model)):
-            raise InvalidField(
-                "model",
-                "expected a Motion, a Sensor, a Factor, a BeamModel or a function of "
-                f"vectors, got {type(model).__name__}",
-            )
-        if (
-            not isinstance(model, Motion | Sensor | Factor | BeamModel)
-            and jacobian is None
-            and makes_a_model(model)
-        ):
-            factory = getattr(model, "__name__", "factory")
-            factory_kind = "class" if isinstance(model, type) else "factory"
-            parameters = inspect.signature(model).parameters.values()
-            noise = "noise_cov" if any(p.default is p.empty for p in parameters) else ""
-            raise InvalidField(
-                "model",
-                f"expected a Motion, a Sensor or a Factor, got the {factory_kind} "
-                f"{factory} of one: call it, as in {factory}({noise}), or use "
-                f"jaxslam.verify.build({factory})",
-            )
         if not (jacobian is None or callable(jacobian)):
             raise InvalidField("jacobian", f"expected a function, got {describe(jacobian)}")
-    if isinstance(model, Motion | Sensor):
-        kind, name = "motion" if isinstance(model, Motion) else "sensor", model.name
-        model = with_signature_errors(model)
-        functions = functions_of(model)
-    elif isinstance(model, Factor):
-        kind, name, functions = "factor", model.name, (factor_function(model),)
-    elif isinstance(model, BeamModel):
-        with float64():
-            functions = (beam_function(model),)
-        kind, name = "beam model", model.name
-    else:
-        with float64():
-            functions = (plain_function(model, jacobian, arguments, outputs, name, states),)
-        kind, name = "function", functions[0].name
-    samples = None
-    if states is not None:
-        with refusals_of("verify_jacobians"):
-            by_name = kind == "function" and not arguments
-            samples = _samples_of_states(functions[0], states, by_name=by_name)
-    if samples is None and isinstance(model, BeamModel):
-        samples = beam_samples(model, count, seed)
-    evaluated, checks, notes, linearity = examine(model, functions, samples, count, seed)
-    with np.errstate(all="ignore"):
-        findings = [
-            finding
-            for of_function in evaluated
-            for finding in compare_methods(of_function, tolerance, float32_tolerance)
-        ]
-    return Report(name, kind, tuple(findings), checks, linearity, notes)
+        if isinstance(model, type) or not (isinstance(model, Component) or callable(model)):
+            got = f"the class {model.__name__}" if isinstance(model, type) else describe(model)
+            reason = "expected a Motion, a Sensor, a Factor, a BeamModel or a function of vectors"
+            raise InvalidField("model", f"{reason}, got {got}")
+    with float64():
+        if isinstance(model, Component):
+            claims, kind, name = model.claims(), model.kind, model.name
+        else:
+            claims = (function_claim(model, jacobian, arguments, outputs, name, states),)
+            kind, name = "function", claims[0].name
+    with refusals_of("verify_jacobians"):
+        if not claims:
+            raise InvalidField("model", f"expected one with claims, got {describe(model)}")
+        samples = None if states is None else _given(claims[0], states, named=not arguments)
+    evaluated = evaluate_claims(claims, samples, count, seed)
+    findings: list[Finding] = []
+    notes: list[str] = []
+    with float64(), np.errstate(all="ignore"):
+        for e in evaluated:
+            findings += compare_methods(e, tolerance, float32_tolerance)
+            notes += e.notes
+            if samples is None and e.claim.states is None and not e.claim.everywhere:
+                notes += singular_notes(e)
+        checks = tuple(all_checks(evaluated, of_model=kind != "function"))
+        linearity = _typical_linearity(evaluated[0])
+    return Report(name, kind, tuple(findings), checks, linearity, tuple(notes))
 
 
-def build(
-    factory: Callable[..., Motion | Sensor | BeamModel | Factor],
-) -> Motion | Sensor | BeamModel | Factor:
-    """A model made by a class or factory of the registries' form: with noise 0.01 I unless
-    noise has a default, or, of a beam model, with the maximum range of the trial; a factor with
-    nothing.
+def evaluate_claims(
+    claims: Sequence[Claim], states: Samples | None = None, count: int = 24, seed: int = 0
+) -> list[Evaluated]:
+    """All Jacobians of claims, in float64; states: of the first one, in place of samples."""
+    evaluated: list[Evaluated] = []
+    with float64(), np.errstate(all="ignore"):
+        for claim in claims:
+            seen = [Seen(e.claim, e.samples, e.values) for e in evaluated if e.values is not None]
+            samples = states or claim_samples(claim, count, seed, seen)
+            evaluated.append(evaluate_jacobians(claim, samples))
+            states = None
+    return evaluated
 
-    A sensor, and a laser, is mounted off the robot's centre. Raises ValueError where the factory
-    returns none of these.
+
+def _typical_linearity(first: Evaluated) -> float | None:
+    """The median linearity index over the random states; None without noise, or if it fails.
+
+    Standard deviations are those of a usual start: 0.05 of an angle or inverse depth, 0.1 of all
+    else, those of the noise, and none of what is exact.
+    """
+    claim, (tables, labels) = first.claim, first.samples
+    if claim.noise_cov is None and not any(argument.cov for argument in claim.arguments):
+        return None
+    usual = [i for i, label in enumerate(labels) if label in NOMINAL]
+    ends = np.cumsum([table.shape[1] for table in tables])[:-1]
+    function = limit_loops(claim.function) if first.loops else claim.function
+    turn = np.where(np.isfinite(circle := periods(claim.outputs)), circle, 0.0)
+
+    def residual(y: jax.Array, y0: jax.Array) -> jax.Array:
+        return y - y0 - turn * jnp.round((y - y0) / circle)
+
+    def index(*state: jax.Array) -> jax.Array:
+        covs: list[ArrayLike] = []
+        at = list(state)
+        for k, argument in enumerate(claim.arguments):
+            spread = [0.05 if e.endswith(("[rad]", "[1/m]")) else 0.1 for e in argument.entries]
+            covs.append(np.diag(np.square(spread)) * (not argument.exact))
+            if argument.cov is not None:
+                covs[k], at[k] = limit_loops(argument.cov)(*state), jnp.zeros_like(at[k])
+        return linearity_index(
+            lambda x: function(*jnp.split(x, ends)),
+            jnp.concatenate(at),
+            jax.scipy.linalg.block_diag(*covs),
+            residual=residual,
+        ).hessian
+
+    try:
+        by_state = quick_jit(jax.vmap(index))(*(table[usual] for table in tables))
+        return float(np.median(np.asarray(by_state)))
+    except (Exception, SystemExit):  # the checks report what is wrong with the model
+        return None
+
+
+def build(factory: Callable[..., _M]) -> _M:
+    """A model made by a class or factory of the registries' form: with noise 0.01 I where noise has
+    no default, with a maximum range where that has none, and mounted off the robot's centre.
+
+    Raises ValueError where the factory returns no model with claims.
     """
     parameters = inspect.signature(factory).parameters
-    mounted = {"mount": _MOUNT} if "mount" in parameters else {}
-    if "max_range" in parameters:
-        model = factory(max_range=FAR, **mounted)
-        if isinstance(model, BeamModel):
-            return model
-    if all(p.default is not p.empty for p in parameters.values()):
-        model = factory(**mounted)
-        if isinstance(model, Factor | Motion | Sensor):
-            return model
-    probe = factory(lambda *_: None)
-    if not isinstance(probe, Motion | Sensor):
-        raise InvalidField(
-            "factory", f"expected one of a Motion or a Sensor, got {describe(probe)}"
-        )
-    size = len(probe.noises if isinstance(probe, Motion) else probe.measurements)
-    return factory(0.01 * np.eye(size), **mounted)
+    required = [p.name for p in parameters.values() if p.default is p.empty]
+    options: dict[str, object] = {"mount": _MOUNT} if "mount" in parameters else {}
+    if "max_range" in required:
+        options["max_range"] = _MAX_RANGE
+        required.remove("max_range")
+    if len(required) > 1:
+        reason = f"expected one that needs a noise covariance alone, got {', '.join(required)}"
+        raise InvalidField("factory", reason)
+    model = factory(*([lambda *_: None] if required else ()), **options)
+    if not isinstance(model, Component):
+        raise InvalidField("factory", f"expected one of a model, got {describe(model)}")
+    if not required:
+        return model
+    claim = model.claims()[0]
+    noises = [argument.entries for argument in claim.arguments if argument.cov is not None]
+    return factory(0.01 * np.eye(len((*noises, claim.outputs)[0])), **options)
 
 
-def _samples_of_states(
-    function: Function, states: Sequence[ArrayLike], *, by_name: bool
-) -> Samples:
+def _given(claim: Claim, states: Sequence[ArrayLike], *, named: bool) -> Samples:
     """The states of the caller; raises InvalidField on a wrong shape.
 
-    by_name: whether lengths may follow from the names of the arguments.
+    named: whether lengths may follow from the names of the arguments.
     """
     tables = [np.asarray(table, np.float64) for table in states]
-    wanted = [len(argument.entries) for argument in function.arguments]
     shapes = [table.shape for table in tables]
-    fits = len(tables) == len(wanted) and all(
-        table.shape == (len(tables[0]), n) for table, n in zip(tables, wanted, strict=True)
-    )
-    if not fits or len(tables[0]) == 0:
-        expected = ", ".join(f"(S, {n})" for n in wanted)
+    sizes = [len(argument.entries) for argument in claim.arguments]
+    rows = shapes[0][:1] if shapes else ()
+    if rows in ((), (0,)) or shapes != [(*rows, n) for n in sizes]:
+        expected = ", ".join(f"(S, {n})" for n in sizes)
         fixed = [
-            f"the name {argument.name} fixes {len(argument.entries)} entries, which arguments="
-            f'{{"{argument.name}": {table.shape[1]}}} changes'
-            for argument, table in zip(function.arguments, tables, strict=False)
-            if by_name and argument.name in NAMED and table.ndim == 2
-            if table.shape[1] != len(argument.entries)
+            f"the name {argument.name} fixes {n} entries, which arguments="
+            f'{{"{argument.name}": {shape[1]}}} changes'
+            for argument, n, shape in zip(claim.arguments, sizes, shapes, strict=False)
+            if named and argument.name in NAMED and len(shape) == 2 and shape[1] != n
         ]
         reason = "; ".join([f"expected shapes {expected}, got {shapes}", *fixed])
         raise InvalidField("states", reason)

@@ -8,7 +8,7 @@ from cases import swept
 
 from jaxslam import motion, sensors
 from jaxslam.core.protocols import Motion
-from jaxslam.verify import _comparison, _examination, _verifier, build
+from jaxslam.verify import _comparison, _properties, _verifier, build
 
 MODELS = motion.REGISTRY | sensors.REGISTRY
 
@@ -20,20 +20,20 @@ MODELS = motion.REGISTRY | sensors.REGISTRY
 def verified(request):
     """A registered model, all that was computed about it, and what that was judged to be."""
     model = build(MODELS[request.param])
-    evaluated, checks, *_ = _examination.examine(model, _examination.functions_of(model))
+    evaluated = _verifier.evaluate_claims(model.claims())
     findings = [
         finding
-        for function in evaluated
+        for claim in evaluated
         for finding in _comparison.compare_methods(
-            function, _verifier.TOLERANCE, _verifier.FLOAT32_TOLERANCE
+            claim, _verifier.TOLERANCE, _verifier.FLOAT32_TOLERANCE
         )
     ]
     return SimpleNamespace(
         model=model,
         findings=findings,
-        checks=checks,
+        checks=list(_properties.all_checks(evaluated, of_model=True)),
         evaluated=evaluated,
-        labels=[function.samples.labels for function in evaluated],
+        labels=[claim.samples.labels for claim in evaluated],
     )
 
 
@@ -56,7 +56,7 @@ def test_everything_is_verified(verified):
     assert [str(f.wrong_entries) for f in verified.findings if not f.passed] == []
     assert [(c.name, c.detail) for c in verified.checks if not c.passed] == []
     required = {
-        check.format(examined.function.name) for examined in verified.evaluated for check in OF_EACH
+        check.format(examined.claim.name) for examined in verified.evaluated for check in OF_EACH
     }
     if isinstance(verified.model, Motion):
         required |= set(OF_A_MOTION)
@@ -76,8 +76,8 @@ def test_hand_is_autodiff_at_every_sample(verified):
     """
     far = getattr(verified.model, "carry", None) is not None
     double, single = (1e5 * 2**-53, 1e5 * 2**-24) if far else (1e-12, 1e-5)
-    functions = [e.function for e in verified.evaluated if e.function.outputs]
-    assert len(verified.findings) == sum(bool(a.entries) for f in functions for a in f.arguments)
+    claims = [e.claim for e in verified.evaluated if e.claim.outputs]
+    assert len(verified.findings) == sum(bool(a.entries) for c in claims for a in c.arguments)
     for finding in verified.findings:
         assert finding.methods == ("jacfwd", "jacrev", "hand", "differences")
         assert finding.relative <= double
@@ -122,7 +122,7 @@ def mutations(jacobian):
 def test_every_wrong_entry_is_caught_and_named(verified):
     tried = 0
     for evaluated in verified.evaluated:
-        function = evaluated.function
+        claim = evaluated.claim
         for k, evaluation in enumerate(evaluated.by_argument):
             for i, j, mutant in mutations(evaluation.methods["hand"]):
                 changed = evaluation._replace(methods=evaluation.methods | {"hand": mutant})
@@ -135,7 +135,7 @@ def test_every_wrong_entry_is_caught_and_named(verified):
                 )
                 assert [f.passed for f in findings] == [n != k for n in range(len(findings))]
                 (wrong,) = findings[k].wrong_entries
-                name = (function.outputs[i], function.arguments[k].entries[j])
+                name = (claim.outputs[i], claim.arguments[k].entries[j])
                 assert (wrong.row, wrong.column) == name
                 assert wrong.dissent == ("hand",)
                 tried += 1

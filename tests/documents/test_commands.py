@@ -120,7 +120,7 @@ def test_what_is_run_again_after_a_change_of_the_code(commands):
         return [one != other for one, other in zip(before, after, strict=True)]
 
     assert changed("simulation/scenarios/_published.py") == [True, False]
-    assert changed("verify/_examination.py") == [False, True]
+    assert changed("verify/_verifier.py") == [False, True]
     assert changed("_cli/recorded/slam.py") == [False, False]
 
 

@@ -3,6 +3,7 @@
 import dataclasses
 from functools import partial
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -11,13 +12,12 @@ from own_models import changed, sensor_of
 from verified import failed
 
 from jaxslam import _cli as cli
-from jaxslam import graphs, motion, sensors
-from jaxslam.core.protocols import Sensor
+from jaxslam import charts, core, graphs, motion, sensors
 from jaxslam.core.record import record
 from jaxslam.laser.grids import beam_models
 from jaxslam.math import se2
 from jaxslam.math.angles import wrap
-from jaxslam.verify import Check, Report, _inputs, _properties, build, verify_jacobians
+from jaxslam.verify import Check, Report, _inputs, _jacobians, _properties, build, verify_jacobians
 
 LASER = build(sensors.RangeBearing)
 CAMERA = build(sensors.BearingOnly)
@@ -46,7 +46,7 @@ BESIDE_JACOBIANS = {
     "residual with an offset": (
         LASER,
         {"residual": lambda z, z_hat: LASER.residual(z, z_hat) + 0.1},
-        ["the residual is zero at equality", "the residual is antisymmetric", DIFFERENCE, INVERTED],
+        ["the residual is zero at equality", "the residual is antisymmetric", DIFFERENCE],
     ),
     "inverse that ignores the prior": (
         CAMERA,
@@ -99,24 +99,47 @@ OF_FUNCTIONS = {
 }
 
 
+def drawn(model, count=24):
+    """The claims of a model with samples and values, and no Jacobian."""
+    seen = []
+    for claim in model.claims():
+        samples = _inputs.samples.claim_samples(
+            claim, count, 0, [_inputs.samples.Seen(*e[:3]) for e in seen]
+        )
+        values = np.asarray(jax.jit(jax.vmap(claim.function))(*samples.values))
+        seen.append(_jacobians.Evaluated(claim, samples, values))
+    return seen
+
+
+def checks_beside(evaluated):
+    """The checks of claims beside their Jacobians, by name."""
+    with np.errstate(all="ignore"):
+        checks = [c for e in evaluated for c in _properties.claim_checks(e, evaluated)]
+    return {check.name: check for check in checks}
+
+
+def failures(evaluated):
+    """The names of those that failed."""
+    return [name for name, check in checks_beside(evaluated).items() if not check.passed]
+
+
 @pytest.fixture(scope="module")
 def states():
-    """Of the models, as `verify_jacobians` draws them."""
-    functions = _inputs.functions.motion_functions(INCREMENT)
-    moved = _inputs.samples.argument_samples(functions[0].arguments, 24, 0)
-    seen = {
-        sensor.name: _inputs.samples.sensor_samples(sensor, 24, 0) for sensor in (LASER, CAMERA)
-    }
-    return {"increment": (moved,), **seen}
+    """Of the models, as `verify_jacobians` draws them, with their values."""
+    return {model.name: drawn(model) for model in (INCREMENT, LASER, CAMERA)}
 
 
 @pytest.mark.parametrize("fault", BESIDE_JACOBIANS)
 def test_a_fault_beside_the_jacobians_is_found(fault, states):
     model, changes, names = BESIDE_JACOBIANS[fault]
-    wrong = changed(model, **changes)
-    checks = _properties.sensor_checks if isinstance(model, Sensor) else _properties.motion_checks
-    with np.errstate(all="ignore"):
-        assert [c.name for c in checks(wrong, *states[model.name]) if not c.passed] == names
+    claims = changed(model, **changes).claims()
+    evaluated = [e._replace(claim=c) for c, e in zip(claims, states[model.name], strict=True)]
+    if "step" in changes:  # else the values are as before
+        evaluated = [
+            e._replace(values=np.asarray(jax.vmap(e.claim.function)(*e.samples.values)))
+            for e in evaluated
+        ]
+    assert failures(evaluated) == names
 
 
 @pytest.mark.parametrize("fault", OF_FUNCTIONS)
@@ -176,9 +199,27 @@ def test_a_sensor_whose_embed_fails_is_still_looked_at():
     assert not report.passed
 
 
-def test_a_factory_in_place_of_a_model_is_named():
-    with pytest.raises(ValueError, match=r"got the class RangeBearing of one: call it"):
-        verify_jacobians(sensors.RangeBearing)
+@refused(
+    (lambda: verify_jacobians(sensors.RangeBearing), "model: expected .*, got the class RangeB"),
+    (lambda: verify_jacobians(charts.Euclidean()), "model: expected one with claims, got .*Euc"),
+)
+def test_what_claims_nothing_is_refused(call):
+    call()
+
+
+def test_a_model_may_claim_more():
+    """A function of the user's beside those of the base, with a slip in its Jacobian."""
+
+    class Marked(sensors.RangeBearing):
+        def claims(self):
+            arguments = (core.claims.Argument("landmark", self.landmark),)
+            slip = core.claims.Claim(
+                "square", lambda at: at**2, arguments, ("x [m2]", "y [m2]"), jnp.diag
+            )
+            return (*super().claims(), slip)
+
+    report = verify_jacobians(record(Marked)(0.01 * np.eye(2)), count=2)
+    assert failed(report) == ["square by landmark"] and report.kind == "sensor"
 
 
 def test_the_report_says_which_jacobians_have_no_claim():
@@ -241,8 +282,7 @@ def test_the_states_of_a_sensor_are_those_of_its_inverse_too():
     assert report.passed, report
     assert [f.samples for f in report.findings] == [10] * 4
     assert np.isfinite(report.linearity)
-    drawn = _inputs.samples.sensor_samples(mast_camera(), 24, 0)
-    assert [c.name for c in _properties.sensor_checks(mast_camera(), *drawn) if not c.passed] == []
+    assert failures(drawn(mast_camera())) == []
 
 
 def stereo(support):
@@ -270,10 +310,17 @@ def test_a_measurement_outside_its_support_is_not_tried():
     assert "invert and its derivatives are finite" in failed(verify_jacobians(unlimited, count=4))
     report = verify_jacobians(limited, count=4)
     assert report.passed, report
-    drawn = [_inputs.samples.sensor_samples(model, 4, 0) for model in (unlimited, limited)]
-    np.testing.assert_equal(drawn[1][0].values, drawn[0][0].values)  # of `observe` all remain
-    z = drawn[1][1].values[1]
+    all_of, some_of = drawn(unlimited, 4), drawn(limited, 4)
+    # Of `observe` all remain.
+    np.testing.assert_equal(some_of[0].samples.values, all_of[0].samples.values)
+    z = some_of[1].samples.values[1]
     assert (z[:, 1] > 0).all() and (z[:, 0] == 0).any() and (np.abs(z[:, 0]) > 3.14159).any()
+
+
+def test_a_free_range_is_not_negative():
+    """Of 10 m, known to 5 m: else `invert` would put the landmark behind the camera."""
+    free = drawn(CAMERA, 1000)[1].samples.values[2]
+    assert free.min() >= 0 and free.std() > 4
 
 
 @refused(
@@ -286,9 +333,7 @@ def test_a_support_that_is_none_is_refused(support):
 
 
 def test_a_failed_round_trip_names_entry_and_state():
-    camera = mast_camera(-1.0)
-    drawn = _inputs.samples.sensor_samples(camera, 24, 0)
-    checks = {check.name: check for check in _properties.sensor_checks(camera, *drawn)}
+    checks = checks_beside(drawn(mast_camera(-1.0)))
     assert checks[INVERTED].detail.startswith("bearing [rad] is off by ")
     assert ", at pose = (" in checks[INVERTED].detail
 
@@ -302,12 +347,11 @@ def test_a_round_trip_off_by_a_turn_says_that_the_unit_is_missing():
     unnamed = changed(
         UNMOUNTED, measurements=names, observe=unwrapped, residual=lambda z, z_hat: z - z_hat
     )
-    drawn = _inputs.samples.sensor_samples(unnamed, 24, 0)
-    checks = {check.name: check for check in _properties.sensor_checks(unnamed, *drawn)}
+    checks = checks_beside(drawn(unnamed))
     assert checks[INVERTED].detail.startswith(
         "bearing is off by 2π (an angle's name ends in [rad])"
     )
-    assert "the residual is a difference" in checks
+    assert checks["the residual is a difference"].passed
 
 
 # --- Beam models under `verify`: both pass, a wrong derivative does not, and a file may define on--
@@ -385,8 +429,3 @@ def test_a_file_has_factors_by_themselves_by_factories_and_classes(tmp_path, tex
     path = tmp_path / "mine.py"
     path.write_text(f"from jaxslam import graphs\nfrom jaxslam.core.record import record\n{text}")
     assert [(t.name, t.model.name) for t in _inputs.user_files.load(str(path))] == [(name, factor)]
-
-
-def test_a_class_in_the_place_of_a_factor_is_to_be_called():
-    with pytest.raises(ValueError, match=r"got the class Prior of one: call it, as in Prior\(\)"):
-        verify_jacobians(graphs.Prior)

@@ -292,6 +292,6 @@ def test_only_the_named_factory_is_built(tmp_path):
         user_files.load(f"{path}:bad")
     with pytest.raises(
         user_files.UnusableFile,
-        match="the factory number: factory: expected one of a Motion or a Sensor, got 3",
+        match="the factory number: factory: expected one of a model, got 3",
     ):
         user_files.load(f"{path}:number")

@@ -1,17 +1,20 @@
-"""The states at which models are verified: random ones, and difficult ones by unit."""
+"""The states at which claims are verified: random ones, and difficult ones by unit and domain."""
 
-from collections.abc import Callable, Iterable
+import contextlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import NamedTuple, TypeAlias
 
 import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxslam.core.protocols import POSE, Sensor
+from jaxslam.core.claims import Argument, Claim, Gaussian, Points, ValuesOf
+from jaxslam.core.protocols import POSE
 from jaxslam.math._xla import quick_jit
-from jaxslam.verify._inputs.functions import Argument, periods, robot_argument
+from jaxslam.verify._inputs.functions import periods
 
-Values: TypeAlias = Float[np.ndarray, "_ _"]
+Table: TypeAlias = Float[np.ndarray, "_ _"]
 """States (S, n) of one argument."""
 
 FAR = 1e5
@@ -24,6 +27,7 @@ NOMINAL = ("random", "given")
 """Labels of the states that are not chosen to be difficult."""
 LARGE = "large coordinates"
 """Label of the states `FAR` from the origin."""
+_SHIFT = np.array([[FAR, -FAR], [-FAR, FAR]])
 _SEAM = 1e-9
 """Distance from the seam of an angle, and from 0 of a rate; well above the rounding of π."""
 
@@ -37,203 +41,205 @@ _HARD = {
     "[s]": (0.0,),
     "[1/m]": (0.0, _SEAM, -_SEAM, -0.5),
 }
+_WITHIN = 1.7
+"""Standard deviations of a prior within which its random values are: a range of 10 ± 5 m is none
+below 0."""
+_HALF_TURN = {"[rad]": np.pi, "[deg]": 180.0}
+"""Largest random angle by its unit."""
+_SPREAD = {"[m]": 3.0, "[1/m]": 0.2}
+"""Standard deviation of random values by their unit; 1 of others."""
 
-_Group: TypeAlias = tuple[str, tuple[Values, ...]]
-"""A label, and states (S, n) for each argument."""
+_Group: TypeAlias = tuple[str, dict[int, Table]]
+"""A label, and states of some arguments by position; of the others the first random ones."""
 
 
 class Samples(NamedTuple):
     """S states: an array (S, n) for each argument, and a label for each state."""
 
-    values: tuple[Values, ...]
+    values: tuple[Table, ...]
     labels: tuple[str, ...]
 
 
-def argument_samples(arguments: tuple[Argument, ...], count: int, seed: int) -> Samples:
-    """Samples of a function's arguments by their units: random, difficult, near, far and zero."""
+class Seen(NamedTuple):
+    """The values of a claim at its samples."""
+
+    claim: Claim
+    samples: Samples
+    values: Float[np.ndarray, "S m"]
+
+
+def claim_samples(claim: Claim, count: int, seed: int, before: Sequence[Seen] = ()) -> Samples:
+    """Samples of a claim: random, difficult, near, far and zero, by the domains of its arguments.
+
+    before: the claims before; one whose values are an argument gives it, and the arguments of the
+    same names. Where the functions of a domain fail, as `embed`, all samples are by the units.
+    """
+    if claim.states is not None:
+        return Samples(*claim.states(count, seed))
+    with contextlib.suppress(Exception, SystemExit):
+        return _samples(claim, count, seed, before)
+    arguments = tuple(replace(argument, domain=None) for argument in claim.arguments)
+    return _samples(replace(claim, arguments=arguments), count, seed, ())
+
+
+def _samples(claim: Claim, count: int, seed: int, before: Sequence[Seen]) -> Samples:
     rng = np.random.default_rng(seed)
-    base = tuple(_sampled_argument(rng, argument, count) for argument in arguments)
-    groups: list[_Group] = [("random", base)]
-    for k, argument in enumerate(arguments):
-        groups += list(_one_at_a_time(base, k, argument))
-        if not _is_place(argument):
-            groups.append((f"zero {argument.name}", _replace(base, k, 0.0 * base[k][:4], 4)))
-    others = [k for k, argument in enumerate(arguments) if not _is_place(argument)]
-    if len(others) > 1:
-        still = tuple(a[:2] * (k not in others) for k, a in enumerate(base))
-        groups.append((f"zero {' and '.join(arguments[k].name for k in others)}", still))
-    places = [k for k, argument in enumerate(arguments) if _is_place(argument)]
-    if places:
-        shift = np.array([[FAR, -FAR], [-FAR, FAR]])
-        far = [table[:2].copy() for table in base]
-        for k in places:
-            far[k][:, :2] += shift
-        groups.append((LARGE, tuple(far)))
+    held: dict[str, Table] = {}
+    reach: dict[int, Callable[[Table], np.ndarray]] = {}
+    for k, argument in enumerate(claim.arguments):
+        if isinstance(domain := argument.domain, ValuesOf):
+            (seen,) = (s for s in before if s.claim.name == domain.claim)
+            usual = [i for i, label in enumerate(seen.samples.labels) if label in NOMINAL]
+            names = [argument.name for argument in seen.claim.arguments]
+            held = dict(zip(names, (a[usual] for a in seen.samples.values), strict=True))
+            held[argument.name], count = seen.values[usual], len(usual)
+            reach[k] = _reach(seen.values, argument.entries, domain.support)
+    base: list[Table] = []
+    around: list[_Group] = []
+    for k, argument in enumerate(claim.arguments):
+        if argument.name in held:
+            base.append(held[argument.name])
+        elif isinstance(domain := argument.domain, Gaussian):
+            draws = rng.uniform(-_WITHIN, _WITHIN, (count, len(argument.entries)))
+            base.append(np.asarray(domain.mean) + draws @ np.linalg.cholesky(domain.cov).T)
+        elif isinstance(domain, Points):
+            landmarks, around = _landmarks(rng, domain, argument.name, base[0], k)
+            base.append(landmarks)
+        else:
+            base.append(_random(rng, argument, count))
+    if held and "given" in seen.samples.labels:
+        return Samples(tuple(base), ("given",) * count)
+
+    groups: list[_Group] = [("random", dict(enumerate(base)))]
+    for k, argument in enumerate(claim.arguments):
+        for label, rows, table in _one_at_a_time(argument, base[k]):
+            if k not in reach or reach[k](table).all():
+                groups.append((label, {i: a[rows] for i, a in enumerate(base)} | {k: table}))
+    places = [k for k, argument in enumerate(claim.arguments) if _is_place(argument)]
+    zeros = {
+        k: np.where(reach[k](0 * base[k]), 0.0, base[k]) if k in reach else 0.0 * base[k]
+        for k, argument in enumerate(claim.arguments)
+        if argument.entries and k not in places and not isinstance(argument.domain, Points)
+    }
+    groups += [(f"zero {claim.arguments[k].name}", {k: zero[:4]}) for k, zero in zeros.items()]
+    if len(zeros) > 1:
+        label = f"zero {' and '.join(claim.arguments[k].name for k in zeros)}"
+        groups.append((label, {k: zero[:2] for k, zero in zeros.items()}))
+    if places and not around:
+        groups.append((LARGE, {k: _shifted(base[k][:2], _SHIFT) for k in places}))
     for k in places[1:]:
         for distance in (_NEAR, 2.0**-4):
             close = base[k][:2].copy()
             close[:, :2] = base[places[0]][:2, :2] + distance * np.array([[1, 0.5], [-0.25, 1]])
-            groups.append((f"{arguments[k].name} close", _replace(base, k, close, 2)))
-    return _concatenate(groups)
+            groups.append((f"{claim.arguments[k].name} close", {k: close}))
+    if claim.everywhere:
+        groups += coincident_states(claim.arguments, base)
+    labels, tables = [], []
+    for label, changed in [*groups, *around]:
+        size = len(next(iter(changed.values())))
+        labels += [label] * size
+        tables.append([changed.get(k, a[:size]) for k, a in enumerate(base)])
+    return Samples(tuple(map(np.concatenate, zip(*tables, strict=True))), tuple(labels))
 
 
-def coincident_states(
-    arguments: tuple[Argument, ...], samples: Samples
-) -> Iterable[tuple[str, tuple[np.ndarray, ...]]]:
-    """States where distances vanish, with a label: each place at the origin, or at the first."""
-    state = [table[0].copy() for table in samples.values]
+def _landmarks(
+    rng: np.random.Generator, points: Points, name: str, pose: Table, k: int
+) -> tuple[Table, list[_Group]]:
+    """Landmarks of random points, first seen from another pose than the present one, and groups of
+    close, coincident, far and large ones."""
+    elsewhere = _random(rng, Argument("pose", POSE), len(pose))
+    offset = 4 * rng.normal(size=(len(pose), 2))
+    near = _NEAR * np.sign(offset[:4])
+    few, first, robot = pose[:4], pose[:4].copy(), pose[:4, :2]
+    first[:, :2] = np.round(first[:, :2] * 64) / 64
+    ahead = np.stack([np.cos(few[:, 2]), np.sin(few[:, 2])], axis=1)
+    away = _shifted(pose[:2], _SHIFT)
+    eye = np.asarray(quick_jit(jax.vmap(points.frame))(few), np.float64)[:, :2]
+    # Each with the present pose, the pose from which the landmark was first seen, and its point.
+    cases = {
+        "random": (pose, elsewhere, pose[:, :2] + offset),
+        f"{name} close to the robot": (first, first, first[:, :2] + near),
+        f"{name} behind, on the seam": (few, elsewhere[:4], robot - 5 * ahead),
+        f"{name} at the robot": (few, few, robot),
+        f"{name} far": (few, few, robot + _OUT_OF_SIGHT),
+        f"{name} close to the sensor": (few, few, eye + near),
+        f"{name} at the sensor": (few, few, eye),
+        LARGE: (away, away, away[:, :2] + offset[:2]),
+    }
+    seen_from = np.concatenate([case[1][:, :3] for case in cases.values()])
+    at = np.concatenate([case[2] for case in cases.values()])
+    landmarks = np.asarray(quick_jit(jax.vmap(points.embed))(seen_from, at), np.float64)
+    ends = np.cumsum([len(case[2]) for case in cases.values()])[:-1]
+    parts = dict(zip(cases, np.split(landmarks, ends), strict=True))
+    table = parts.pop("random")
+    groups = [(label, {0: cases[label][0], k: part}) for label, part in parts.items()]
+    return table, groups if table.size else groups[-1:]
+
+
+def coincident_states(arguments: Sequence[Argument], base: Sequence[Table]) -> Iterator[_Group]:
+    """States where distances vanish: a place at the origin, the next ones at the first."""
     places = [k for k, argument in enumerate(arguments) if _is_place(argument)]
     for k in places:
-        moved = [entry.copy() for entry in state]
-        alone = k == places[0]
-        moved[k][:2] = 0.0 if alone else state[places[0]][:2]
-        where = "the origin" if alone else f"the {arguments[places[0]].name}"
-        yield f"{arguments[k].name} at {where}", tuple(moved)
+        moved, first = base[k][:1].copy(), k == places[0]
+        moved[:, :2] = 0.0 if first else base[places[0]][:1, :2]
+        where = "the origin" if first else f"the {arguments[places[0]].name}"
+        yield f"{arguments[k].name} at {where}", {k: moved}
 
 
-def sensor_samples(sensor: Sensor, count: int, seed: int) -> tuple[Samples, Samples]:
-    """Samples (pose, landmark) for `observe`, and (pose, measurement, free) for `invert`.
+def _reach(
+    seen: Table, names: Sequence[str], support: Mapping[str, tuple[float, float]]
+) -> Callable[[Table], np.ndarray]:
+    """The function of values (B, m) -> whether each entry is one that a claim can return.
 
-    Landmarks come from the sensor's own `embed` and `invert`, first seen from another pose than the
-    present one; each of their coordinates also takes its difficult values.
+    An angle is, if it is between the smallest and the largest seen, or if these cover nearly the
+    whole turn. Any entry is only within its support.
     """
-    rng = np.random.default_rng(seed)
-    embed = quick_jit(jax.vmap(sensor.embed))
-    place = quick_jit(jax.vmap(sensor.invert))
-
-    def at(poses: Values, points: Values) -> Values:
-        return np.asarray(embed(poses[:, :3], points), np.float64)
-
-    robot = robot_argument(sensor)
-    pose = _sampled_argument(rng, robot, count)
-    elsewhere = _sampled_argument(rng, Argument("pose", POSE), count)
-    offset = rng.normal(size=(count, 2)) * 4
-    first = pose.copy()
-    first[:, :2] = np.round(first[:, :2] * 64) / 64
-    landmark = at(elsewhere, pose[:, :2] + offset)
-    base = (pose, landmark)
-    groups: list[_Group] = [("random", base)]
-    for k, argument in enumerate((robot, Argument("landmark", sensor.landmark))):
-        groups += list(_one_at_a_time(base, k, argument))
-
-    mean = np.asarray(sensor.free.mean, np.float64)
-    root = np.linalg.cholesky(np.asarray(sensor.free.cov, np.float64)) if len(mean) else mean
-    s = mean + rng.normal(size=(count, len(mean))) @ np.reshape(root, (len(mean), len(mean))).T
-    z = np.asarray(quick_jit(jax.vmap(sensor.observe))(pose, landmark), np.float64)
-    metres = np.array([name.endswith("[m]") for name in sensor.measurements])
-    few = slice(0, 4)
-    if sensor.landmark:
-        turn = np.stack([np.cos(pose[:, 2]), np.sin(pose[:, 2])], axis=1)
-        close = first[few, :2] + _NEAR * np.sign(offset[few])
-        ahead = pose[few, :2] - 5 * turn[few]
-        groups += [
-            ("landmark close to the robot", (first[few], at(first[few], close))),
-            ("landmark behind, on the seam", (pose[few], at(elsewhere[few], ahead))),
-            ("landmark at the robot", (pose[few], at(pose[few], pose[few, :2]))),
-            ("landmark far", (pose[few], at(pose[few], pose[few, :2] + _OUT_OF_SIGHT))),
-        ]
-        for label, scale in ("landmark close to the sensor", _NEAR), ("landmark at the sensor", 0):
-            seen = np.where(metres, z[few] * scale, z[few])
-            near = np.asarray(place(pose[few], seen, s[few] * scale), np.float64)
-            if np.isfinite(near).all():  # else `invert` fails, which another check reports
-                groups.append((label, (pose[few], near)))
-    corners = np.array([[FAR, -FAR], [-FAR, FAR]])
-    away = pose[:2].copy()
-    away[:, :2] += corners
-    groups.append((LARGE, (away, at(away, away[:, :2] + offset[:2]))))
-    observed = _concatenate(groups)
-
-    back: list[_Group] = [("random", (pose, z, s))]
-    back += list(_one_at_a_time((pose, z, s), 0, robot))
-    seen = np.asarray(quick_jit(jax.vmap(sensor.observe))(*observed.values), np.float64)
-    reached = _reach(seen, sensor)
-    difficult = _one_at_a_time((pose, z, s), 1, Argument("measurement", sensor.measurements))
-    back += [(label, part) for label, part in difficult if reached(part[1]).all()]
-    zero = np.where(reached(0 * z[few]), 0.0, z[few])
-    back.append(("zero measurement", (pose[few], zero, s[few])))
-    if len(mean):
-        back.append(("free coordinates zero", (pose[few], z[few], 0 * s[few])))
-    back.append((LARGE, (away, z[:2], s[:2])))
-    return observed, _concatenate(back)
-
-
-def inverse_samples(sensor: Sensor, states: Samples, sampled: Samples) -> Samples:
-    """Samples (pose, measurement, free) for `invert`: what `observe` returns at a user's states.
-
-    sampled: samples of `invert`, whose free coordinates are used.
-    """
-    z = np.asarray(quick_jit(jax.vmap(sensor.observe))(*states.values), np.float64)
-    s = np.resize(sampled.values[2], (len(z), sampled.values[2].shape[1]))
-    return Samples((states.values[0], z, s), states.labels)
-
-
-def _reach(seen: Values, sensor: Sensor) -> Callable[[Values], np.ndarray]:
-    """The function of measurements (B, m) -> whether each entry is one that the sensor can return.
-
-    An angle is, if it is between the smallest and the largest observed one, or if these cover
-    nearly the whole turn. Any entry is only within the sensor's `support`.
-    """
-    names, circle = sensor.measurements, periods(sensor.measurements)
+    circle = periods(names)
     least, most = np.fmin.reduce(seen), np.fmax.reduce(seen)
     whole_turn = ~np.isfinite(circle) | (most - least > 0.9 * circle)
-    low, high = np.transpose([sensor.support.get(name, (-np.inf, np.inf)) for name in names])
+    limits = [support.get(name, (-np.inf, np.inf)) for name in names]
+    low, high = np.reshape(limits, (-1, 2)).T
     return lambda z: (whole_turn | ((least < z) & (z < most))) & (low < z) & (z < high)
 
 
-def _sampled_entry(rng: np.random.Generator, name: str, count: int) -> Float[np.ndarray, "S"]:
-    """Random values of a coordinate by its unit."""
-    unit = name.split(" ")[-1]
-    if "steering" in name:  # a wheel does not turn by a right angle
-        return rng.uniform(-0.8, 0.8, count)
-    if unit == "[rad]":
-        return rng.uniform(-np.pi, np.pi, count)
-    if unit == "[deg]":
-        return rng.uniform(-180, 180, count)
-    if unit == "[s]":
-        return np.abs(rng.normal(size=count))
-    if unit == "[1/m]":
-        return 0.3 + 0.2 * rng.normal(size=count)
-    return rng.normal(size=count) * (3.0 if unit == "[m]" else 1.0)
-
-
-def _sampled_argument(rng: np.random.Generator, argument: Argument, count: int) -> Values:
-    """Random values of an argument."""
-    columns = [_sampled_entry(rng, name, count) for name in argument.entries]
-    table = np.stack(columns, axis=1) if columns else np.zeros((count, 0))
-    table = argument.scale * table
+def _random(rng: np.random.Generator, argument: Argument, count: int) -> Table:
+    """Random values of an argument by its units."""
+    table = np.zeros((count, len(argument.entries)))
+    for k, name in enumerate(argument.entries):
+        unit = name.split(" ")[-1]
+        if "steering" in name:  # a wheel does not turn by a right angle
+            table[:, k] = rng.uniform(-0.8, 0.8, count)
+        elif unit in _HALF_TURN:
+            table[:, k] = rng.uniform(-_HALF_TURN[unit], _HALF_TURN[unit], count)
+        else:
+            table[:, k] = rng.normal(size=count) * _SPREAD.get(unit, 1.0)
+            table[:, k] += 0.3 * (unit == "[1/m]")
+            if unit == "[s]":
+                table[:, k] = np.abs(table[:, k])
+    table *= argument.scale
     if argument.scale != 1:  # noise: zero in half of the states
         table[::2] = 0
     return table
 
 
 def _is_place(argument: Argument) -> bool:
-    """Whether the argument is a pose or a point."""
-    return argument.entries[:2] == POSE[:2]
+    """Whether the argument is a pose or a point, drawn by its units."""
+    return argument.entries[:2] == POSE[:2] and argument.domain is None
 
 
-def _one_at_a_time(base: tuple[Values, ...], k: int, argument: Argument) -> Iterable[_Group]:
-    """States in which one entry of an argument has a difficult value."""
+def _shifted(table: Table, by: Table) -> Table:
+    """Poses or points moved in the plane."""
+    return np.concatenate([table[:, :2] + by, table[:, 2:]], axis=1)
+
+
+def _one_at_a_time(argument: Argument, base: Table) -> Iterator[tuple[str, list[int], Table]]:
+    """The difficult values of each entry: a label, the row of the other entries, the argument."""
     for column, name in enumerate(argument.entries):
         hard = np.array(_HARD.get(name.split(" ")[-1], ()))
         if "steering" in name:
             hard = hard[np.abs(hard) < 1]
-        if len(hard) and argument.scale == 1:
-            count = len(hard)
-            rows = np.arange(count) % len(base[k])
-            moved = base[k][rows].copy()
-            moved[:, column] = hard
-            for i, value in enumerate(hard):
-                state = tuple(a[rows[i : i + 1]] for a in base)
-                label = f"{argument.name} {name.split(' ')[0]} = {value:.4g}"
-                yield label, _replace(state, k, moved[i : i + 1], 1)
-
-
-def _replace(base: tuple[Values, ...], k: int, new: Values, count: int) -> tuple[Values, ...]:
-    """The first states, with another value of one argument."""
-    return tuple(new[:count] if i == k else a[:count] for i, a in enumerate(base))
-
-
-def _concatenate(groups: list[_Group]) -> Samples:
-    labels = tuple(label for label, parts in groups for _ in range(len(parts[0])))
-    parts = zip(*(parts for _, parts in groups), strict=True)
-    return Samples(tuple(np.concatenate(part) for part in parts), labels)
+        for i, value in enumerate(hard if argument.scale == 1 else ()):
+            row = [i % len(base)]
+            moved = base[row].copy()
+            moved[:, column] = value
+            yield f"{argument.name} {name.split(' ')[0]} = {value:.4g}", row, moved

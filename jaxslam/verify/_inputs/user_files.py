@@ -3,28 +3,30 @@
 import contextlib
 import dataclasses
 import importlib.util
+import inspect
 import io
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, get_type_hints
 
 from numpy.typing import ArrayLike
 
 from jaxslam.core._validation import is_user_file
-from jaxslam.core.protocols import Chart, Filter, Linearizer, Motion, Sensor
-from jaxslam.graphs import Factor
-from jaxslam.laser.grids.beam_models import BeamModel
+from jaxslam.core.claims import Jacobian
+from jaxslam.core.protocols import Chart, Component, Filter, Linearizer
 from jaxslam.simulation._worlds import World
-from jaxslam.verify import Check, Report
-from jaxslam.verify._examination import Model
-from jaxslam.verify._inputs.functions import Claim, makes_a_model
+from jaxslam.verify import Check, Report, build
 from jaxslam.verify._user_errors import describe_error, place_of_error
-from jaxslam.verify._verifier import build
 
 _CLAIMS = ("_jacobian", "_jacobians")
 """Endings of names: f_jacobian is the hand-derived Jacobian of f."""
+
+_EXPECTED = (
+    "a Motion, a Sensor, a Factor, a class of one whose only required field is noise_cov, a "
+    "function annotated to return one, a BeamModel, or a function f with an f_jacobian"
+)
 
 _ABOUT = ("arguments", "outputs", "states")
 """Endings of names: f_arguments and others are arguments of `verify_jacobians` for f."""
@@ -39,8 +41,8 @@ class _Target:
     """A model or function of a user's file: the arguments of `verify_jacobians`."""
 
     name: str
-    model: Model
-    jacobian: Claim | None = None
+    model: Any
+    jacobian: Jacobian | None = None
     arguments: Mapping[str, Sequence[str] | int] | None = None
     outputs: Sequence[str] | None = None
     states: Sequence[ArrayLike] | None = None
@@ -77,13 +79,11 @@ def _recorded_prints() -> Iterator[_PrintRecorder]:
 def load(target: str) -> list[_Target]:
     """The models and functions that `file.py` or `file.py:name` defines, in the order of the file.
 
-    These are objects of the types `Motion`, `Sensor`, `graphs.Factor` and `grids.BeamModel`;
-    classes of motion models and sensors whose only required field is noise_cov, and of factors
-    without required fields; factories annotated to return one, whose only required parameter is a
-    noise covariance, or a factor, without required parameters; and functions f with a function
-    f_jacobian (or f_jacobians), whose entries may be named as
-    f_arguments = {"pose": ("x [m]", …), …} and f_outputs = ("range [m]", …), and their states given
-    as f_states = (array (S, n), …).
+    These are models with claims, as `Motion`, `Sensor`, `graphs.Factor` and `grids.BeamModel`;
+    classes of them that need noise_cov alone, or nothing; functions annotated to return one, of a
+    noise covariance or of nothing; and functions f with a function f_jacobian (or
+    f_jacobians), whose entries may be named as f_arguments = {"pose": ("x [m]", …), …} and
+    f_outputs = ("range [m]", …), and their states given as f_states = (array (S, n), …).
 
     Raises:
         UnusableFile: with the line, if the file is missing, does not import, or defines none.
@@ -96,29 +96,16 @@ def load(target: str) -> list[_Target]:
     if targets and skipped:
         note = f"not verified: {', '.join(skipped)} (no chart and no linearizer is)"
         targets[0] = dataclasses.replace(targets[0], notes=(*targets[0].notes, note))
-    if name:
-        if not targets and keys:
-            value = vars(module)[name]
-            hint = f", got a {type(value).__name__}"
-            if callable(value):
-                hint = (
-                    f": define {name}{_CLAIMS[0]}, or call jaxslam.verify_jacobians({name}) from "
-                    "Python, which needs none"
-                )
-            raise UnusableFile(
-                f"{path.name}: expected {name} to be a Motion, a Sensor, a class of one whose only "
-                "required field is noise_cov, a factory of one, a Factor, a BeamModel, or a "
-                f"function with its Jacobian{hint}"
-            )
-        if not targets:
-            raise UnusableFile(f"{path.name}: there is no {name!r} to verify{names_in(module)}")
-    if not targets:
-        raise UnusableFile(
-            f"{path.name}: defines nothing to verify: no Motion, no Sensor, no class of one whose "
-            "only required field is noise_cov, no Factor, no BeamModel, no function f with an "
-            "f_jacobian, no factory whose result is annotated as -> Motion, -> Sensor or -> Factor"
-        )
-    return targets
+    if targets:
+        return targets
+    if name and not keys:
+        raise UnusableFile(f"{path.name}: there is no {name!r} to verify{names_in(module)}")
+    if not name:
+        raise UnusableFile(f"{path.name}: defines nothing to verify: expected {_EXPECTED}")
+    hint = f"got a {type(value := vars(module)[name]).__name__}"
+    if callable(value):
+        hint = f"define {name}_jacobian, or call jaxslam.verify_jacobians({name}) in Python"
+    raise UnusableFile(f"{path.name}: expected {name} to be {_EXPECTED}; {hint}")
 
 
 def verify_file(target: str, verify_one: Callable[..., Report]) -> list[Report]:
@@ -211,9 +198,10 @@ def names_in(module: ModuleType) -> str:
         name
         for name, value in vars(module).items()
         if not name.startswith("_")
-        and not (isinstance(value, type) and not issubclass(value, Motion | Sensor | Factor))
+        and not (isinstance(value, type) and not _has_claims(value))
         and (
-            isinstance(value, Motion | Sensor | Factor | BeamModel | Filter | World)
+            _has_claims(type(value))
+            or isinstance(value, Filter | World)
             or (callable(value) and getattr(value, "__module__", "") == module.__name__)
         )
     ]
@@ -224,28 +212,41 @@ def _target(module: ModuleType, name: str) -> _Target | None:
     """The object to verify under a name of the module, or None."""
     value = getattr(module, name)
     about: dict[str, Any] = {ending: getattr(module, f"{name}_{ending}", None) for ending in _ABOUT}
-    if isinstance(value, Motion | Sensor | Factor | BeamModel):
-        return _model_target(name, value, about)
-    if not callable(value):
-        return None
     claims = [getattr(module, name + end) for end in _CLAIMS if hasattr(module, name + end)]
-    if len(claims) > 1:
-        raise UnusableFile(f"expected {name}_jacobian or {name}_jacobians, got both")
-    if claims:
+    if callable(value) and claims and not isinstance(value, Component):
+        if len(claims) > 1:
+            raise UnusableFile(f"expected {name}_jacobian or {name}_jacobians, got both")
         return _Target(name, value, claims[0], **about)
-    if getattr(value, "__module__", "") == module.__name__ and makes_a_model(value):
+    if getattr(value, "__module__", "") == module.__name__ and _is_factory(value):
         try:
-            return _model_target(name, build(value), about)
+            value = build(value)
         except Exception as error:
             kind = "class" if isinstance(value, type) else "factory"
             raise UnusableFile(f"the {kind} {name}: {describe_error(error)}") from error
-    return None
-
-
-def _model_target(
-    name: str, model: Motion | Sensor | Factor | BeamModel, about: Mapping[str, Any]
-) -> _Target:
-    """A model with the states beside it; it names its entries and has its claims itself."""
+    if not _has_claims(type(value)):
+        return None
     unused = [f"{name}_{end}" for end in ("arguments", "outputs") if about[end] is not None]
     notes = (f"not used: {', '.join(unused)} (a model names its entries)",) if unused else ()
-    return _Target(name, model, states=about["states"], notes=notes)
+    return _Target(name, value, states=about["states"], notes=notes)
+
+
+def _has_claims(kind: object) -> bool:
+    """Whether a class is one of models with claims."""
+    if not (isinstance(kind, type) and issubclass(kind, Component)):
+        return False
+    return kind.claims is not Component.claims
+
+
+def _is_factory(value: object) -> bool:
+    """Whether this is a class of models with claims that needs noise_cov alone, or nothing; or a
+    function, annotated to return one, of at most one required argument."""
+    is_class = isinstance(value, type)
+    with contextlib.suppress(Exception):  # what has no signature, or names what is not there
+        returned = value if is_class else get_type_hints(value)["return"]
+        parameters = inspect.signature(value).parameters.values()  # type: ignore[arg-type]
+        required = [p.name for p in parameters if p.default is p.empty]
+        return _has_claims(returned) and required in (
+            [],
+            ["noise_cov"] if is_class else required[:1],
+        )
+    return False

@@ -1,5 +1,6 @@
 """The base class of beam models, and the log-likelihood of a scan under it."""
 
+from functools import partial
 from typing import Any
 
 import jax.numpy as jnp
@@ -9,7 +10,8 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxslam.core._numbers import is_concrete
 from jaxslam.core._reprs import shape_text
-from jaxslam.core.protocols import Component
+from jaxslam.core.claims import Argument, Claim
+from jaxslam.core.protocols import POSE, Component
 from jaxslam.core.types import Beams, JaxOrNumPy
 from jaxslam.core.validation import (
     InvalidField,
@@ -20,13 +22,15 @@ from jaxslam.core.validation import (
     require,
 )
 from jaxslam.laser.grids._grid import Grid
+from jaxslam.laser.grids.beam_models._smooth_room import ANGLES, poses_and_ranges, smooth_map
 from jaxslam.math import se2
-from jaxslam.math._arrays import Number
+from jaxslam.math._arrays import Number, in_dtype
 
 
 class BeamModel(Component):
     """A density of the range of each beam, given pose and map; a subclass is a record."""
 
+    kind = "beam model"
     jacobian: Any = None
     """(prepared, pose, beams) -> (B, 3), derivatives of `log_likelihoods` by the pose, derived by
     hand: `verify` compares them with automatic differentiation and differences"""
@@ -49,6 +53,33 @@ class BeamModel(Component):
         if self.mount is None:
             return pose
         return se2.compose(pose, jnp.asarray(self.mount, pose.dtype))
+
+    def claims(self) -> tuple[Claim, ...]:
+        """The claim of the log-densities of eight beams by pose and ranges, in a smooth room."""
+        prepared = self.prepare(smooth_map())
+        numbers = range(1, len(ANGLES) + 1)
+
+        def beams(ranges: Array) -> Beams:
+            return Beams(ranges, jnp.asarray(ANGLES, ranges.dtype), jnp.ones(len(ANGLES), bool))
+
+        def log_density(pose: Array, ranges: Array) -> Array:
+            return self.log_likelihoods(in_dtype(prepared, pose.dtype), pose, beams(ranges))
+
+        def jacobian(pose: Array, ranges: Array) -> tuple[Array, None]:
+            return self.jacobian(in_dtype(prepared, pose.dtype), pose, beams(ranges)), None
+
+        mount = np.zeros(3) if self.mount is None else np.asarray(self.mount, np.float64)
+        names = tuple(f"range {k} [m]" for k in numbers)
+        return (
+            Claim(
+                "log_density",
+                log_density,
+                (Argument("pose", POSE), Argument("ranges", names)),
+                tuple(f"beam {k}" for k in numbers),
+                None if self.jacobian is None else jacobian,
+                states=partial(poses_and_ranges, mount),
+            ),
+        )
 
 
 def log_likelihood(
