@@ -360,14 +360,13 @@ def initialize(
             evicted = filter.life.make_room(joint, needed, measured)
             joint = without_landmarks(filter, joint, evicted)
         occupied = joint.alive if reserved is None else joint.alive | reserved
-        slot, granted = slots.allocate(occupied, wanted)
-        new = NewLandmarks(slot, granted, deferred, repeated)
-        z, tag, limit = scan.z, scan.tag, m if births is None else births
+        z, tag, candidate, limit = scan.z, scan.tag, wanted, m if births is None else births
         if limit < m:  # only as many landmarks are computed as may start
-            is_kth = granted[None, :] & (rank[None, :] == 1 + jnp.arange(limit)[:, None])
+            is_kth = wanted[None, :] & (rank[None, :] == 1 + jnp.arange(limit)[:, None])
             # The measurement (limit,) of each birth, where there are so many.
-            source, granted = last_true_column(is_kth)
-            z, tag, slot = z[source], tag[source], slot[source]
+            source, candidate = last_true_column(is_kth)
+            z, tag = z[source], tag[source]
+        slot, granted = slots.allocate(occupied, candidate)
         robot_cov = slots.robot_cov(joint, filter.square_root)
         point = LinearizationPoint(joint, chart, joint.robot, robot_cov)
         landmark, by_pose, own_cov = jax.vmap(partial(invert, point))(z, tag)
@@ -378,9 +377,10 @@ def initialize(
         # max, since a measurement without a slot has index 0, which may be another's slot.
         entered = jnp.zeros_like(joint.alive).at[slot].max(granted)
         joint = joint._replace(lin=filter.linearize.remember(joint, entered))
-        if limit < m:  # back from the births to the measurements
-            by_pose = by_pose[jnp.clip(rank - 1, 0, limit - 1)]
-        return joint, new, evicted, by_pose
+        if limit < m:  # back from the births (k) to the measurements (M)
+            k = jnp.clip(rank - 1, 0, limit - 1)
+            slot, granted, by_pose = slot[k], wanted & granted[k], by_pose[k]
+        return joint, NewLandmarks(slot, granted, deferred, repeated), evicted, by_pose
 
     def start_none(joint: Joint) -> _Initialized:
         return joint, no_landmark, none_evicted, no_jacobian
