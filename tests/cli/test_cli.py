@@ -22,7 +22,7 @@ QUICK = ["consistency", "--scenario", "circle", "--steps", "8", "--runs", "3"]
 
 def test_consistency_prints_a_table_and_writes_everything(tmp_path, capsys, monkeypatch, undrawn):
     out, filmed = tmp_path / "results", []
-    monkeypatch.setattr(cli.consistency, "_write_films", lambda *a: filmed.append(a) or 0)
+    monkeypatch.setattr(cli.consistency, "write_films", lambda *a: filmed.append(a) or 0)
     options = ["--filters", "dead_reckoning,localization", "--no-bound", "--seed", "4", "--animate"]
     shape = ["--block", "1", "--devices", "1"]
     assert cli.main([*QUICK, *options, *shape, "--out", str(out)]) == 0
