@@ -29,7 +29,7 @@ from jaxslam.core.validation import at_least, or_none, positive, require
 from jaxslam.datasets._judged_folders import DrawsFolder, folder_source, read_draws, run_name
 from jaxslam.results import _campaign_files as campaign_files
 from jaxslam.results import store
-from jaxslam.results._block_files import MANIFEST
+from jaxslam.results._block_files import MANIFEST, is_unfinished
 from jaxslam.results._campaign_files import BLOCKS, FORMATS, JUDGED
 from jaxslam.simulation._worlds import World
 
@@ -217,8 +217,12 @@ def plan_of(options: argparse.Namespace, user: UserObjects) -> JudgePlan:
     devices = chosen_devices(options.devices)
     check_out(options.out, "judge")
     blocks = options.out / BLOCKS
-    if (blocks / MANIFEST).exists() and store.resume(blocks).settings != JUDGED:
-        raise ValueError(f"--out: {options.out} holds a campaign: choose another folder")
+    # They are replaced at the end, so nothing else may be there.
+    if (blocks / MANIFEST).exists():
+        if store.resume(blocks).settings != JUDGED:
+            raise ValueError(f"--out: {options.out} holds a campaign: choose another folder")
+    elif blocks.exists() and not all(map(is_unfinished, blocks.iterdir())):
+        raise ValueError(f"--out: {blocks} is none of jaxslam judge: choose another folder")
     if options.estimator is not None and len(folders) > 1:
         raise ValueError(f"--estimator: expected one folder of estimates, got {len(folders)}")
     return JudgePlan(draws, folders, world, filters, runs, devices, formats)

@@ -139,12 +139,14 @@ def _codes(code: CodeType) -> Iterator[CodeType]:
 def _source_of(function: FunctionType) -> str:
     """The source of a function without comments, docstrings and layout.
 
-    Of code that no file has, as of `exec`, it is the bytecode, which differs between versions of
-    Python.
+    Of code that no file has, as of `exec` or of a file that was edited since it was loaded, it is
+    the bytecode, which differs between versions of Python.
     """
     code = function.__code__
+    linecache.checkcache(code.co_filename)  # the file may have been written again
     text = "".join(linecache.getlines(code.co_filename, function.__globals__))
-    nodes = _functions(text).get((code.co_firstlineno, code.co_name), [])
+    functions, compiled = _functions(text)
+    nodes = functions.get((code.co_firstlineno, code.co_name), []) if code in compiled else []
     if len(nodes) > 1:  # lambdas of one line: the innermost in which every instruction lies
         columns = [c for line, _, c, end in code.co_positions() if line and c is not None and end]
         around = [
@@ -173,13 +175,16 @@ def _syntax(value: object) -> str:
 
 
 @functools.lru_cache(maxsize=8)
-def _functions(text: str) -> dict[tuple[int, str], list[ast.FunctionDef | ast.Lambda]]:
-    """The functions of a source file without docstrings, by first line and name."""
+def _functions(
+    text: str,
+) -> tuple[dict[tuple[int, str], list[ast.FunctionDef | ast.Lambda]], frozenset[CodeType]]:
+    """The functions of a source file without docstrings, by first line and name; and their code."""
     functions: dict[tuple[int, str], list[ast.FunctionDef | ast.Lambda]] = {}
     try:
         tree = ast.parse(text)
+        compiled = frozenset(_codes(compile(text, "", "exec", dont_inherit=True)))
     except SyntaxError:  # a cell with commands of its own
-        return functions
+        return functions, frozenset()
     for node in ast.walk(tree):
         if isinstance(node, ast.Lambda):
             functions.setdefault((node.lineno, "<lambda>"), []).append(node)
@@ -188,7 +193,7 @@ def _functions(text: str) -> dict[tuple[int, str], list[ast.FunctionDef | ast.La
                 node.body = node.body[1:] or [ast.Pass()]
             first = min([node.lineno, *(part.lineno for part in node.decorator_list)])
             functions.setdefault((first, node.name), []).append(node)
-    return functions
+    return functions, compiled
 
 
 def _text_of_class(cls: type, within: tuple[object, ...]) -> str:

@@ -97,6 +97,15 @@ def test_our_ekf_by_files_has_the_numbers_of_the_campaign(
     assert {"report.html", "nees.png", "map.png"} <= {path.name for path in out.iterdir()}
 
 
+def test_a_folder_of_other_blocks_is_left_alone(draws, estimates, tmp_path, undrawn, capsys):
+    own = tmp_path / "out" / "blocks" / "notes.txt"
+    own.parent.mkdir(parents=True)
+    own.write_text("of the user")
+    assert judge(estimates, "--draws", draws, "--out", tmp_path / "out") == 2
+    assert "blocks is none of jaxslam judge" in capsys.readouterr().err
+    assert own.read_text() == "of the user"
+
+
 def assert_loaded_as_judged(out, again):
     """The folder of `jaxslam judge` is read back with every number, fault and note."""
     loaded = load(out)

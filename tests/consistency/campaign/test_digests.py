@@ -188,6 +188,8 @@ def test_a_digest_of_a_function_is_of_its_source_without_comments_and_layout(tmp
     assert len({scaled, first, second}) == 3
     other = digests_of_file(tmp_path / "b.py", comment="# no docstring", aside="# scaled")
     assert other == [scaled, first, second]
+    # The same file, written again.
+    assert other == digests_of_file(tmp_path / "b.py", comment="# of the author\n    # and more")
     changes = [{"factor": 3.0}, {"end": " + 1"}, {"last": "x + 3"}]
     changed = [digests_of_file(tmp_path / f"{i}.py", **text) for i, text in enumerate(changes)]
     assert [[a != b for a, b in zip(row, other, strict=True)] for row in changed] == [
@@ -195,6 +197,16 @@ def test_a_digest_of_a_function_is_of_its_source_without_comments_and_layout(tmp
         [True, False, False],
         [False, False, True],
     ]
+
+
+def test_a_file_that_was_edited_since_it_was_loaded_says_nothing_of_the_code(tmp_path):
+    path = tmp_path / "a.py"
+    path.write_text(SCALED.format(**SAME))
+    scaled = runpy.run_path(str(path))["scaled"]
+    loaded = digests.digest(scaled)
+    path.write_text(SCALED.format(**SAME | {"end": " + 1"}))
+    edited = digests.digest(runpy.run_path(str(path))["scaled"])
+    assert len({digests.digest(scaled), loaded, edited}) == 3
 
 
 def test_a_digest_of_code_without_a_file_is_of_what_it_does():
